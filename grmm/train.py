@@ -24,13 +24,14 @@ from torch.nn.parallel import DistributedDataParallel
 
 from express50 import native
 from express50.console import count, log
-from express50.errors import DivergedError, NotReadyError
+from express50.errors import DivergedError, FormatError, NotReadyError
 from express50.files.atomic import check_space, write_json
+from express50.files.text import read_json_table
 from express50.geometry.sampling import evenly
 from express50.head.model import HeadModel
 from grmm import losses
 from grmm.checkpoint import collect_gallery
-from grmm.config import Config
+from grmm.config import Config, as_tables
 from grmm.data import HeadView, HeadViews, Source
 from grmm.evaluate import REGIONS, component_effects, evaluate, mean, training_render
 from grmm.metrics import PerceptualMetrics
@@ -245,7 +246,17 @@ def objective(
 def report(
     state: TrainState, config: Config, out: Path, perceptual: PerceptualMetrics
 ) -> dict[str, object]:
-    """Evaluate, draw previews and write metrics.json."""
+    """Evaluate, draw previews and write metrics.json, unless it has the figures of this state."""
+    measured: dict[str, object] = {
+        "iterations": state.iteration,
+        "seconds": round(state.seconds, 2),
+        "measured_with": as_tables(config)["metrics"] | {"images": config.train.evaluate_images},
+    }
+    with contextlib.suppress(FormatError):  # there is none, or it is damaged
+        found = read_json_table(out / "metrics.json", FormatError)
+        if measured.items() <= found.items():
+            log(f"{out}: the figures were measured before; delete metrics.json to measure again")
+            return found
     log("measuring the model, component by component, and drawing previews")
     model, views, count = state.model, state.views, config.train.evaluate_images
     render = training_render(model, views)
@@ -280,8 +291,7 @@ def report(
         "gaussians": len(model.texels),
         "texels": config.model.n_g**2,
         "parameters": sum(parameter.numel() for parameter in model.parameters()),
-        "iterations": state.iteration,
-        "seconds": round(state.seconds, 2),
+        **measured,
         "iterations_per_second": round(state.iteration / max(state.seconds, 1e-9), 3),
         "terms": {name: round(float(value), 6) for name, value in state.terms.items()},
     }

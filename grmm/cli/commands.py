@@ -62,7 +62,7 @@ def train(args: argparse.Namespace) -> int:
     names = ("psnr_heldout_view_db", *new, "psnr_train_db", "ssim", "iterations", "gaussians")
     values = {name: metrics.get(name) for name in names}
     lines = [f"{figure_label(k)}: {'n/a' if v is None else v}" for k, v in values.items()]
-    code = answer(args, metrics, *lines, f"wrote {args.out / 'checkpoint.pt'}")
+    code = answer(args, metrics, *lines, f"checkpoint: {args.out / 'checkpoint.pt'}")
     if diverged(metrics):
         log(
             "training images score worse than plain grey: training diverged; lower train.lr and "
