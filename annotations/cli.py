@@ -311,17 +311,27 @@ def run_undo(args: argparse.Namespace) -> int:
     last = last_event(events, args.expression, args.annotator)
     if last is None:
         raise AnnotationError(
-            f"{args.subject} {args.expression}: {args.annotator} has no label on it to undo"
+            f"{args.subject} {args.expression}: {args.annotator} has no label on it to undo;"
+            f" {_in_force(events, args.expression)}"
         )
     return _keep(args, undo, f"{describe(last)} undone")
 
 
+def _in_force(events: Sequence[Label], expression: str) -> str:
+    label = current_labels(events).get(expression)
+    return (
+        f"{describe(label)} by {label.annotator} is in force" if label else "no label is in force"
+    )
+
+
 def _keep(args: argparse.Namespace, label: Label, said: str) -> int:
-    append_label(args.dataset, label)
-    settled = overruling(read_labels(args.dataset, label.subject), label)
+    label = append_label(args.dataset, label)
+    events = read_labels(args.dataset, label.subject)
     after = f"run {advised('express50 align', args.dataset.root)} to use it"
-    if settled is not None:
+    if (settled := overruling(events, label)) is not None:
         after = in_spite_of(settled)
+    elif label.action == "undo":
+        after = f"now {_in_force(events, label.expression)}; {after}"
     words = f"{label.subject} {label.expression}: {said} by {label.annotator}; {after}"
     return answer(args, asdict(label), words)
 
@@ -344,7 +354,7 @@ def run_validate(args: argparse.Namespace) -> int:
     wrong = [p for p in found if p.kind != "coverage"]
     counts = dict(sorted(Counter(p.kind for p in found).items()))
     data = {"ok": not wrong, "counts": counts, "problems": [asdict(p) for p in found]}
-    lines = [f"{p.subject} {p.expression}: {p.kind}: {p.what}" for p in wrong]
+    lines = [f"{p.subject} {p.expression}".rstrip() + f": {p.kind}: {p.what}" for p in wrong]
     answer(args, data, *lines, f"{len(wrong)} wrong, {counts.get('coverage', 0)} without a label")
     return FAILED if wrong else OK
 
@@ -371,7 +381,7 @@ def run_review(args: argparse.Namespace) -> int:
         chosen_subjects(args.dataset, [subject])
         index = read_index(args.dataset, subject)
         label = settlement(args.dataset, index, expression, verdict, args.annotator)
-        append_label(args.dataset, label)
+        label = append_label(args.dataset, label)
         words = f"{subject} {expression}: settled as {describe(label)} by {args.annotator}"
         return answer(args, asdict(label), words)
     queue = disagreements(
@@ -453,8 +463,7 @@ def run_rule(args: argparse.Namespace) -> int:
     known = dict.fromkeys(cue.expression_id for index in indexes for cue in index.cues)
     check_known(str(args.dataset.root), "expression", args.expression or (), known)
     marks = [m for i in indexes for m in last_frame_marks(args.dataset, i, args.expression)]
-    for mark in marks:
-        append_label(args.dataset, mark)
+    marks = [append_label(args.dataset, mark) for mark in marks]
     words = f"{count(len(marks), 'mark')} by {LAST_FRAME} in {count(len(chosen), 'subject')}"
     return answer(args, [asdict(mark) for mark in marks], words)
 
@@ -469,7 +478,7 @@ def run_exclusion(args: argparse.Namespace) -> int:
         subject=args.subject, expression="", action=args.action, annotator=args.annotator,
         time=time.time(), reason=reason,
     )  # fmt: skip
-    append_label(args.dataset, event)
+    event = append_label(args.dataset, event)
     because = f": {event.reason}" if event.reason else ""
     lines = [f"{args.subject}: {args.action}d{because}"]
     try:

@@ -104,7 +104,7 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
     held = [label for s in {x.subject for x in labels} for label in read_labels(dataset, s)]
     new = _unknown(list(dict.fromkeys(labels)), held)
     for label in new:
-        append_label(dataset, label)
+        append_label(dataset, label, imported=True)
     return len(new), len(labels) - len(new)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -167,21 +168,29 @@ def check_texts(label: Label) -> None:
             )
 
 
-def append_label(dataset: Dataset, label: Label) -> None:
+def append_label(dataset: Dataset, label: Label, imported: bool = False) -> Label:
     """Append one event and sync it to disk; several annotators at once lose nothing.
 
+    Unless it is `imported`, it counts after all that was said before, even if this machine's clock
+    is behind: the event that is returned then has a later time.
+
     Raises:
-        AnnotationError: a text is not one line.
+        AnnotationError: a text is not one line, or a line of the file is not an event.
         OSError: it could not be written; it is then missing, or a torn line that readers skip.
     """
     check_texts(label)
     path = dataset.labels_file(label.subject)
     path.parent.mkdir(parents=True, exist_ok=True)
-    row = {k: v for k, v in asdict(label).items() if v is not None}
-    line = (json.dumps(row, sort_keys=True) + "\n").encode()
     handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
     try:
         lock_file(handle, path)
+        before = [] if imported else read_labels(dataset, label.subject)
+        times = [
+            math.nextafter(x.time, math.inf) for x in before if x.expression == label.expression
+        ]
+        label = replace(label, time=max([label.time, *times]))
+        row = {k: v for k, v in asdict(label).items() if v is not None}
+        line = (json.dumps(row, sort_keys=True) + "\n").encode()
         size = os.fstat(handle).st_size
         if size and os.pread(handle, 1, size - 1) != b"\n":
             line = b"\n" + line  # a writer died half-way: its torn line must not absorb this one
@@ -192,6 +201,7 @@ def append_label(dataset: Dataset, label: Label) -> None:
         os.close(handle)
     if size == 0:  # the file's name must outlive a power cut too
         sync_directory(path.parent)
+    return label
 
 
 def read_labels(dataset: Dataset, subject: str) -> list[Label]:

@@ -140,8 +140,7 @@ def accept_sure(
     labels = read_labels(dataset, index.subject)
 
     def write(label: Label) -> None:
-        append_label(dataset, label)
-        labels.append(label)
+        labels.append(append_label(dataset, label))
 
     known = _automatic(labels)
     for cue in index.cues:

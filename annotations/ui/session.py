@@ -166,7 +166,7 @@ class Session:
         self._book()
         spent = self._efforts[self.position]
         label = replace(label, seconds=round(spent.seconds, 2), keys=spent.keys)
-        append_label(self.dataset, label)
+        label = append_label(self.dataset, label)
         self._decided.append(self.position)
         self._open.discard(self.tasks[self.position].key)
         del self._efforts[self.position]
@@ -178,15 +178,17 @@ class Session:
         The task it was about becomes the open one. Return what was taken back, which is a
         settlement where the annotator gave one since; None when there is nothing.
         """
-        target = self._decided.pop() if self._decided else self.position
+        target = self._decided[-1] if self._decided else self.position
         if not self.tasks:
             return None
         task = self.tasks[target]
         if task.expression not in self._said(task.subject):
+            del self._decided[-1:]
             return None
         index = read_index(self.dataset, task.subject)
         last = last_event(read_labels(self.dataset, task.subject), task.expression, self.annotator)
         append_label(self.dataset, make_event(index, task.expression, "undo", self.annotator))
+        del self._decided[-1:]  # only now: it may not have been possible to write
         if task.expression not in self._said(task.subject):
             self._open.add(task.key)
         self._go(target)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from annotations import align, observe
+from annotations.align.stage import accept_sure
 from annotations.labels import (
     AUTOMATIC,
     append_label,
@@ -69,6 +70,14 @@ def test_a_damaged_line_of_labels_is_a_warning(watched):
     assert run(watched, ["S001"]).ok
     found = metrics_of(watched, "align", "S001")
     assert "line 1 of S001" in found["warnings"][0]["why"]
+
+
+def test_an_automatic_label_of_a_clock_that_was_ahead_can_be_taken_back(watched):
+    index = read_index(watched, "S001")
+    mark = make_mark(index, "smile", 21, "cam01", AUTOMATIC)
+    append_label(watched, replace(mark, time=mark.time + 3600))
+    assert accept_sure(watched, index, {}, 1.0) == {}  # it wrote one undo after the other
+    assert [label.action for label in read_labels(watched, "S001")] == ["mark", "undo"]
 
 
 def test_a_label_in_a_camera_that_is_gone_costs_only_its_expression(watched):

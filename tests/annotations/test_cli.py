@@ -342,7 +342,13 @@ def test_undo_and_review_say_what_they_mean(annotate, dataset, capsys):
     mark(annotate, "ann", "smile", 15)
     words = ["--annotator", "ann"]
     assert main(["annotate", "undo", str(dataset.root), "S001", "smile", *words]) == 0
-    assert "frame 15 undone" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "frame 15 undone by ann; now frame 14 by ann is in force; run" in said
+    mark(annotate, "bob", "smile", 16)
+    assert main(["annotate", "undo", str(dataset.root), "S001", "smile", *words]) == 0
+    assert "frame 14 undone by ann; now frame 16 by bob is in force" in capsys.readouterr().out
+    assert main(["annotate", "undo", str(dataset.root), "S001", "smile", *words]) == 1
+    assert "ann has no label on it to undo; frame 16 by bob is" in capsys.readouterr().err
     assert main(["annotate", "review", str(dataset.root)]) == 0
     assert "at most 2 frames apart agree" in capsys.readouterr().out
 

@@ -87,6 +87,17 @@ def test_an_older_label_that_an_import_put_below_is_not_its_annotators_latest():
     assert labels_of(undone, "ann") == {"smile": old}
 
 
+def test_a_clock_that_was_ahead_does_not_outlive_what_is_said_next(tmp_path):
+    dataset, index = Dataset(tmp_path), _index(tmp_path)
+    append_label(dataset, _mark(3, "ann", time.time() + 3600))
+    mark = append_label(dataset, make_mark(index, "smile", 5, "a", "ann"))
+    assert current_labels(read_labels(dataset, "S1"))["smile"] == mark
+    for left in (3, None):
+        append_label(dataset, make_event(index, "smile", "undo", "ann"))
+        force = current_labels(read_labels(dataset, "S1")).get("smile")
+        assert (force and force.frame) == left
+
+
 def test_automatic_labels_do_not_change_the_human_digest(tmp_path):
     dataset = Dataset(tmp_path)
     before = human_digest(dataset, "S1")

@@ -67,7 +67,7 @@ def test_the_latest_event_decides_though_an_import_put_an_older_one_below(tmp_pa
         event = Label(
             subject="S001", expression="", action=action, annotator="ann", time=when, reason="old"
         )
-        append_label(dataset, event)
+        append_label(dataset, event, imported=True)
     assert exclusion_reason(dataset, "S001") is None
 
 

@@ -78,6 +78,16 @@ def test_undo_returns_to_the_task_and_appends_an_event(suggested):
     assert labels_of(events, "ann") == {}
 
 
+def test_an_undo_that_cannot_be_written_can_be_repeated(suggested, monkeypatch):
+    session, _ = begin(suggested)
+    mark(session)
+    with monkeypatch.context() as patch:
+        patch.setattr("annotations.ui.session.append_label", None)
+        with pytest.raises(TypeError):
+            session.undo()
+    assert session.undo().expression == "neutral"
+
+
 def test_undo_of_a_second_mark_restores_the_first(suggested):
     session, _ = begin(suggested)
     mark(session)
