@@ -1,9 +1,9 @@
 """``express50 plan`` scales measured datasets' receipts to the cost of a capture campaign.
 
-Seconds per item are modelled as a constant plus a term proportional to the product of the sizes
-that the stage's `Growth` names. Datasets of two sizes separate the two terms, and every figure has
-an interval. Bytes are taken as proportional. Part of the memory is constant, so memory is given as
-measured, which is a lower bound.
+Seconds and bytes per item are modelled as a constant plus a term proportional to the product of the
+sizes that the stage's `Growth` names. Datasets of two sizes separate the two terms, and every
+figure has an interval. Part of the memory is constant, so memory is given as measured, which is a
+lower bound.
 """
 
 from __future__ import annotations
@@ -75,6 +75,8 @@ class Row:
     sizes: int = 0
     days: float | None = None
     disk: float | None = None
+    disk_low: float | None = None
+    disk_high: float | None = None
     memory: float | None = None
     preset: str = ""
     how: str = ""
@@ -131,8 +133,8 @@ def run_plan(args: argparse.Namespace) -> int:
         f"target   {args.target or 'as given'}: {_words(target)}",
         *dict.fromkeys(f"measured {_words(size)}" for size, _ in measured),
         *_table(rows, total, args.workers),
-        "core hours: with a 90 % interval; part of a stage's time or disk may be constant, which "
-        "only a second dataset of another size can show (--also DATASET)",
+        "core hours, disk: with 90 % intervals; part of a stage's time or disk may be constant, "
+        "which only a second dataset of another size can show (--also DATASET)",
         "s per item: of one core; stages one after the other, no item split over workers",
         "peak memory: as measured; more footage may need more",
         f"disk: without replaced outputs ({decimal(replaced)} here); stages keep two per item "
@@ -154,17 +156,22 @@ def _table(rows: Sequence[Row], total: Mapping[str, Any], workers: int) -> Itera
         if not row.why:
             hours = _hours(row.core_hours, row.core_hours_low, row.core_hours_high)
             figures = [f"{row.seconds:.1f}", hours, f"{row.days:.2f}"]
-            figures += [decimal(int(row.disk or 0)), f">= {decimal(int(row.memory or 0))}"]
+            figures += [_disk(vars(row)), f">= {decimal(int(row.memory or 0))}"]
             measured = [row.preset, str(row.sizes), row.how]
         cells.append([row.stage, str(row.items), *figures, *measured])
     hours = _hours(total["core_hours"], total["core_hours_low"], total["core_hours_high"])
     days = f"{total['days']:.2f}"
-    cells.append(["sum", "", "", hours, days, decimal(int(total["disk"])), "", "", "", ""])
+    cells.append(["sum", "", "", hours, days, _disk(total), "", "", "", ""])
     return format_table(columns, cells)
 
 
 def _hours(value: float | None, low: float | None, high: float | None) -> str:
     return f"{_figure(value or 0, 3)} ({_figure(low or 0, 2)} to {_figure(high or 0, 2)})"
+
+
+def _disk(figures: Mapping[str, Any]) -> str:
+    value, low, high = (decimal(int(figures[f"disk{end}"] or 0)) for end in ("", "_low", "_high"))
+    return f"{value} ({low} to {high})"
 
 
 def _figure(value: float, digits: int) -> str:
@@ -262,7 +269,7 @@ def estimate(
     Workers are processes of one core each. Only datasets of the first one's preset count.
     """
     # Imported here, because NumPy would slow every command.
-    from express50.dial.choice import MeasuredSize, forecast, typical_seconds
+    from express50.dial.choice import MeasuredSize, forecast
 
     rows = []
     for stage in known:
@@ -282,7 +289,7 @@ def estimate(
         ratio = target.time(growth) / footage.time(growth)
         kept = [MeasuredSize(f.work(growth.disk), [c.bytes]) for f, c in alike]
         # The law of seconds holds for bytes too: a surface is as large whatever the pictures.
-        disk = typical_seconds(kept, target.work(growth.disk))
+        disk = forecast(kept, target.work(growth.disk))
         rows.append(
             Row(
                 stage=stage.name,
@@ -293,7 +300,9 @@ def estimate(
                 core_hours_high=items * item.high / 3600,
                 sizes=item.sizes,
                 days=items * item.value / 86400 / min(workers, items),
-                disk=items * disk,
+                disk=items * disk.value,
+                disk_low=items * disk.low,
+                disk_high=items * disk.high,
                 memory=max(c.memory for _, c in alike),
                 preset=cost.preset,
                 how=f"{' x '.join(growth.time) or 'constant'} = {_figure(ratio, 4)}",
@@ -305,7 +314,8 @@ def estimate(
 def totals(rows: Sequence[Row]) -> dict[str, Any]:
     """Add up the stages that were measured, and list those that were not."""
     known = [row for row in rows if not row.why]
-    names = ("core_hours", "core_hours_low", "core_hours_high", "days", "disk")
+    ends = ("", "_low", "_high")
+    names = ["days", *(name + end for name in ("core_hours", "disk") for end in ends)]
     return {name: sum(getattr(row, name) or 0.0 for row in known) for name in names} | {
         "presets": dict(Counter(row.preset for row in known)),
         "not_measured": [row.stage for row in rows if row.why],

@@ -151,6 +151,7 @@ def test_two_sizes_tell_what_does_not_grow_and_the_interval_holds_a_third():
     (alone,) = estimate([stage], unseen, measured[:1], 1)
     assert alone.sizes == 1 and alone.seconds == pytest.approx(20 * 5.0)
     assert alone.core_hours_low < row.core_hours < alone.core_hours_high
+    assert alone.disk_low < row.disk_low < row.disk < row.disk_high < alone.disk_high
 
 
 def test_sizes_near_the_one_in_question_count_most():
