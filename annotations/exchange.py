@@ -28,10 +28,10 @@ from annotations.labels import (
     append_label,
     check_texts,
     current_labels,
+    lost_frame,
     make_mark,
     read_labels,
 )
-from annotations.validate import footage_problems
 from express50.capture.index import UNKNOWN_HASH, Index, read_index
 from express50.console import count
 from express50.contract.layout import Dataset
@@ -98,9 +98,8 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
         cues = [cue.expression_id for cue in index.cues]
         check_known(where, "expression", named, cues, AnnotationError)
         check_texts(label)
-        for kind, what in footage_problems(index, label):
-            if kind != "window":
-                raise AnnotationError(f"{where}: {what}; was it made on other footage?")
+        if what := lost_frame(index, label):
+            raise AnnotationError(f"{where}: {what}; was it made on other footage?")
     held = [label for s in {x.subject for x in labels} for label in read_labels(dataset, s)]
     new = _unknown(list(dict.fromkeys(labels)), held)
     for label in new:

@@ -19,7 +19,7 @@ from typing import get_type_hints
 from express50 import __version__
 from express50.capture.index import Cue, Index, same_hash
 from express50.contract.layout import Dataset
-from express50.errors import AnnotationError, check_known
+from express50.errors import AnnotationError, UnknownNameError, check_known
 from express50.files.atomic import lock_file, sync_directory
 from express50.files.text import parse_json, read_bytes
 
@@ -146,12 +146,38 @@ def find_cue(index: Index, expression: str) -> Cue:
     return cues[expression]
 
 
-def shows_labelled_frame(index: Index, label: Label) -> bool:
-    """Return whether the footage still holds the frame that was labelled."""
-    source, frame = index.cameras.get(label.camera or ""), label.frame or 0
-    if source is None or not 0 <= frame < source.frames:
-        return False
-    return same_hash(source.dhash[frame], label.dhash)
+def footage_problems(index: Index, label: Label) -> Iterator[tuple[str, str]]:
+    """Compare one event with the footage; return kind and description of each problem."""
+    if not label.expression:  # about the whole subject
+        return
+    try:
+        cue = find_cue(index, label.expression)
+    except UnknownNameError as error:  # cues.csv no longer names it
+        yield "unknown", str(error)
+        return
+    if label.frame is None:
+        return
+    source = index.cameras.get(label.camera or "")
+    if source is None:
+        yield "unknown", f"no camera {label.camera!r} in the footage"
+        return
+    for name in ("first", "frame", "last"):
+        frame = getattr(label, name)
+        if frame is not None and not cue.start_frame <= frame <= cue.end_frame:
+            window = f"{cue.start_frame} to {cue.end_frame}"
+            yield "window", f"{name} {frame} lies outside the cue window {window}"
+    if not 0 <= label.frame < source.frames:
+        yield "identity", f"{label.camera} has {source.frames} frames, and no frame {label.frame}"
+        return
+    pts, dhash = source.pts[label.frame], source.dhash[label.frame]
+    if pts != label.pts or not same_hash(dhash, label.dhash):
+        found = f"frame {label.frame} of {label.camera} has pts {pts} and hash {dhash}"
+        yield "identity", f"{found}, the label says {label.pts} and {label.dhash}"
+
+
+def lost_frame(index: Index, label: Label) -> str:
+    """Return why a label's frame is not in the footage; an empty text if it is, or has none."""
+    return next((what for kind, what in footage_problems(index, label) if kind != "window"), "")
 
 
 def check_texts(label: Label) -> None:

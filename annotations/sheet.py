@@ -11,7 +11,7 @@ from functools import partial
 import jinja2
 import numpy as np
 
-from annotations.labels import Label, current_labels, origin, read_labels, shows_labelled_frame
+from annotations.labels import Label, current_labels, lost_frame, origin, read_labels
 from annotations.suggestions import Suggested, read_suggestions, reference_subject
 from annotations.ui.frames import FaceFinder, crop_to, zoom_box
 from annotations.validate import disagreements
@@ -171,7 +171,7 @@ def _filled(tile: Tile, index: Index, label: Label | None, hint: Suggested | Non
         camera=label.camera if label.camera in index.cameras else fallback,
         by=label.annotator + (", settled" if label.action == "settle" else ""),
         confidence=label.confidence if state == "auto" else None,
-        words="" if shows_labelled_frame(index, label) else "labelled on other footage",
+        words="labelled on other footage" if lost_frame(index, label) else "",
     )
 
 

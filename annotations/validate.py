@@ -10,7 +10,7 @@ both originals.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -20,7 +20,7 @@ from annotations.labels import (
     FLAG_REASONS,
     Label,
     current_labels,
-    find_cue,
+    footage_problems,
     latest_labels,
     make_flag,
     make_mark,
@@ -28,9 +28,9 @@ from annotations.labels import (
     unreadable_lines,
     voices,
 )
-from express50.capture.index import Index, read_index, same_hash
+from express50.capture.index import Index, read_index
 from express50.contract.layout import Dataset, included_subjects
-from express50.errors import AnnotationError, UnknownNameError, advised
+from express50.errors import AnnotationError, advised
 
 FLAG = "flag:"  # prefix of a free-text reason, which might otherwise be a mistyped name
 WITHIN = (1, 2, 4)  # frames
@@ -84,35 +84,6 @@ def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[LabelP
             what = f"{said}; settle it with {settle}"
             found.append(LabelProblem(row.subject, row.expression, "contradiction", what))
     return found
-
-
-def footage_problems(index: Index, label: Label) -> Iterator[tuple[str, str]]:
-    """Compare one event with the footage; return kind and description of each problem."""
-    if not label.expression:  # about the whole subject
-        return
-    try:
-        cue = find_cue(index, label.expression)
-    except UnknownNameError as error:  # cues.csv no longer names it
-        yield "unknown", str(error)
-        return
-    if label.frame is None:
-        return
-    source = index.cameras.get(label.camera or "")
-    if source is None:
-        yield "unknown", f"no camera {label.camera!r}"
-        return
-    for name in ("first", "frame", "last"):
-        frame = getattr(label, name)
-        if frame is not None and not cue.start_frame <= frame <= cue.end_frame:
-            window = f"{cue.start_frame} to {cue.end_frame}"
-            yield "window", f"{name} {frame} lies outside the cue window {window}"
-    if not 0 <= label.frame < source.frames:
-        yield "identity", f"frame {label.frame} does not exist in {label.camera}"
-        return
-    pts, dhash = source.pts[label.frame], source.dhash[label.frame]
-    if pts != label.pts or not same_hash(dhash, label.dhash):
-        found = f"frame {label.frame} of {label.camera} has pts {pts} and hash {dhash}"
-        yield "identity", f"{found}, the label says {label.pts} and {label.dhash}"
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def run(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="align",
-    version=7,
+    version=8,
     config=AlignConfig,
     items=Dataset.subjects,
     inputs=inputs,

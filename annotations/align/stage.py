@@ -15,6 +15,8 @@ from annotations.labels import (
     Label,
     append_label,
     current_labels,
+    footage_problems,
+    lost_frame,
     make_event,
     make_mark,
     read_labels,
@@ -44,7 +46,7 @@ def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -
     found, dropped = suggest_for(dataset, index, match)
     labels = accept_sure(dataset, index, found, accept)
     dropped += _missing_peaks(index, found, labels, accept)
-    peaks = {e: x for e, x in labels.items() if x.frame is not None and not _gone(index, x)}
+    peaks = {e: x for e, x in labels.items() if x.frame is not None and not lost_frame(index, x)}
     if not peaks:
         raise StageError(f"{item}: no expression has a frame ({dropped[0].why})")
     kept = ("frame", "camera", "pts", "dhash", "confidence", "annotator")
@@ -175,11 +177,10 @@ def _missing_peaks(
     notes = []
     for expression in (cue.expression_id for cue in index.cues):
         label, suggested = labels.get(expression), found.get(expression)
-        gone = "" if label is None else _gone(index, label)
-        if label is not None and label.frame is not None and not gone:
+        if label is not None and (gone := lost_frame(index, label)):
+            why = f"labelled by {label.annotator}: {gone}; label it again with 'express50 annotate'"
+        elif label is not None and label.frame is not None:
             continue
-        if gone:
-            why = f"{gone}; label it again with 'express50 annotate'"
         elif label is not None:
             why = f"flagged: {label.reason or 'no reason given'}"
         elif suggested is None:
@@ -193,28 +194,13 @@ def _missing_peaks(
     return notes
 
 
-def _gone(index: Index, label: Label) -> str:
-    """Return why a label's frame is not in the footage; an empty text if it is, or has none."""
-    if label.frame is None:
-        return ""
-    source, said = index.cameras.get(label.camera or ""), f"labelled by {label.annotator}"
-    if source is None:
-        return f"{said} in camera {label.camera}, which is not in the footage"
-    there = 0 <= label.frame < source.frames
-    return "" if there else f"{said} at frame {label.frame}, but {label.camera} has {source.frames}"
-
-
 def _outside(index: Index, peaks: Mapping[str, Label]) -> list[Note]:
     """Warn of peaks outside their cue windows: they may show another expression."""
+    again = "label it again if cues.csv has changed"
     return [
-        Note(
-            cue.expression_id,
-            f"labelled by {label.annotator} at frame {label.frame}, outside its cue window"
-            f" {cue.start_frame} to {cue.end_frame}; label it again if cues.csv has changed",
-        )
-        for cue in index.cues
-        if (label := peaks.get(cue.expression_id)) is not None
-        if not cue.start_frame <= (label.frame or 0) <= cue.end_frame
+        Note(expression, f"labelled by {label.annotator}: {what}; {again}")
+        for expression, label in peaks.items()
+        for _, what in footage_problems(index, label)
     ]
 
 

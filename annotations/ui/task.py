@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from annotations.labels import Label, current_labels, labels_of, read_labels, shows_labelled_frame
+from annotations.labels import Label, current_labels, labels_of, lost_frame, read_labels
 from annotations.suggestions import (
     CanonicalFrame,
     Suggested,
@@ -73,7 +73,7 @@ def _load(dataset: Dataset, scene: TaskScene, annotator: str) -> TaskScene:
         f"{label.annotator}'s frame {label.frame} of {label.camera} shows another picture in the "
         "present footage: look and mark again"
         for label in (mine, in_force)
-        if label is not None and label.frame is not None and not shows_labelled_frame(index, label)
+        if label is not None and label.frame is not None and lost_frame(index, label)
     ]
     names = list(index.cameras)
     best = names.index(suggestion.camera) if suggestion and suggestion.camera in names else 0

@@ -90,11 +90,19 @@ def test_a_label_in_a_camera_that_is_gone_costs_only_its_expression(watched):
         append_label(watched, replace(mark, **change))
     assert run(watched, ["S001"]).ok
     dropped = {row["what"]: row["why"] for row in metrics_of(watched, "align", "S001")["dropped"]}
-    assert dropped["smile"].startswith("labelled by ann in camera cam9, which is not in the foot")
-    assert dropped["jaw_open"].startswith(
-        f"labelled by ann at frame 999, but cam01 has {3 * FRAMES_EACH};"
-    )
+    assert dropped["smile"].startswith("labelled by ann: no camera 'cam9' in the footage; label it")
+    why = f"labelled by ann: cam01 has {3 * FRAMES_EACH} frames, and no frame 999;"
+    assert dropped["jaw_open"].startswith(why)
     assert "smile" not in peaks(watched, "S001") and "neutral" in peaks(watched, "S001")
+
+
+def test_a_label_whose_frame_shows_another_picture_costs_only_its_expression(watched):
+    mark = make_mark(read_index(watched, "S001"), "smile", 21, "cam01", "ann")
+    append_label(watched, replace(mark, dhash="f" * 16))
+    assert run(watched, ["S001"]).ok
+    (dropped,) = metrics_of(watched, "align", "S001")["dropped"]
+    assert dropped["what"] == "smile" and "the label says 21 and ffffffffffff" in dropped["why"]
+    assert set(peaks(watched, "S001")) == {"neutral", "jaw_open"}
 
 
 def test_a_label_outside_its_cue_window_is_warned_of(watched):
@@ -104,7 +112,7 @@ def test_a_label_outside_its_cue_window_is_warned_of(watched):
     assert run(watched, ["S001"]).ok
     (warning,) = metrics_of(watched, "align", "S001")["warnings"]
     assert warning["what"] == "jaw_open"
-    assert warning["why"].startswith("labelled by ann at frame 21, outside its cue window 3")
+    assert warning["why"].startswith("labelled by ann: frame 21 lies outside the cue window 3")
 
 
 def test_peaks_are_found_and_other_subjects_match_the_reference(watched):
