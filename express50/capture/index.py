@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -263,3 +264,14 @@ def peak_items(dataset: Dataset) -> list[str]:
         if dataset.peaks_file(subject).is_file():
             found += [f"{subject}/{name}" for name in sorted(read_peaks(dataset, subject))]
     return found
+
+
+def tracked_items(dataset: Dataset) -> list[str]:
+    """List the peaks, without those that the track stage left out; its metrics.json says why."""
+    left_out = set()
+    for subject in dataset.subjects():
+        path = dataset.track_file(subject).with_name("metrics.json")
+        with suppress(FormatError, KeyError, TypeError):  # absent, or a file that somebody changed
+            notes = read_json_table(path, FormatError)["dropped"]
+            left_out |= {f"{subject}/{note['what']}" for note in notes}
+    return [item for item in peak_items(dataset) if item not in left_out]

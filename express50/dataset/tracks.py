@@ -7,18 +7,17 @@ error. Nothing in a file is executed: pickled objects are refused.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from express50.capture.index import peak_items
 from express50.contract.layout import Dataset
 from express50.errors import FormatError, HeadModelError, StageError, advised
 from express50.files.arrays import read_arrays
 from express50.files.digests import cached_by_file
-from express50.files.text import ID, read_json_table
+from express50.files.text import ID
 from express50.geometry.shapes import check_finite, check_shape
 from express50.head import HEADS, head_files
 
@@ -136,17 +135,6 @@ def existing_track(dataset: Dataset, subject: str) -> Path:
         track = advised("express50 track", dataset.root)
         raise StageError(f"subject {subject!r} is not tracked; run {track}")
     return path
-
-
-def tracked_items(dataset: Dataset) -> list[str]:
-    """List the peaks, without those that the track stage left out; its metrics.json says why."""
-    left_out = set()
-    for subject in dataset.subjects():
-        path = dataset.track_file(subject).with_name("metrics.json")
-        with suppress(FormatError, KeyError, TypeError):  # absent, or a file that somebody changed
-            notes = read_json_table(path, FormatError)["dropped"]
-            left_out |= {f"{subject}/{note['what']}" for note in notes}
-    return [item for item in peak_items(dataset) if item not in left_out]
 
 
 def track_inputs(dataset: Dataset, subject: str) -> dict[str, Path]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.capture.index import peak_items, read_index
+from express50.capture.index import peak_items, read_index, tracked_items
 from express50.contract.config import check_ranges
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
-from express50.dataset.tracks import tracked_items
 
 
 @dataclass(frozen=True, kw_only=True)

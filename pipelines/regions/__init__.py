@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from express50.capture.index import tracked_items
 from express50.contract.config import check_ranges
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
-from express50.dataset.tracks import tracked_items
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from express50.capture.index import tracked_items
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, NoSettings, Result, Stage
-from express50.dataset.tracks import tracked_items
 
 
 def inputs(dataset: Dataset, item: str, config: NoSettings) -> dict[str, Path | str]:
