@@ -65,8 +65,7 @@ def needs_gpu(config: RegionsConfig) -> bool:
 def try_files(config: RegionsConfig) -> None:
     """Load the network."""
     if config.segmentation:
-        from pipelines.networks import load_network
-        from pipelines.regions.sapiens import SAPIENS
+        from pipelines.networks import SAPIENS, load_network
 
         load_network(config.segmentation, SAPIENS)
 

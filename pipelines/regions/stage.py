@@ -274,8 +274,8 @@ def _write_view(
     labels, large = view.labels, enlarged(view.labels)
     mesh = enlarged(view.mesh.astype(np.uint8)) > 0
     if weights:
-        from pipelines.networks import load_network  # torch takes seconds to import
-        from pipelines.regions.sapiens import SAPIENS, refined, segment
+        # torch takes seconds to import
+        from pipelines.networks import SAPIENS, load_network, refined, segment
 
         labels = large = refined(segment(load_network(weights, SAPIENS), rgb), large)
     else:

@@ -7,9 +7,8 @@ import pytest
 
 from express50.contract.segmentation_labels import LABELS, label_mask
 from express50.errors import StageError
-from pipelines.networks import load_network
+from pipelines.networks import LABEL_OF_CLASS, SAPIENS, load_network, segment
 from pipelines.regions.geometry import head_alpha
-from pipelines.regions.sapiens import LABEL_OF_CLASS, SAPIENS, segment
 from tests.pipelines.stand_ins import Bright, Thirds, torchscript, traced_thirds
 
 
