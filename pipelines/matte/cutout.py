@@ -1,10 +1,11 @@
 """Cut a person out of all pictures of a frame set at once, without plates or weights.
 
 The faces that the cameras see place a head in the world, and so show roughly where skull, hair and
-shoulders are in every picture, even from behind. GrabCut (Rother, Kolmogorov and Blake 2004) finds
-their outlines by colours; heads of other people close by count as wall. Then the cameras correct
-each other: the person is nowhere that others see past them, and, if they are many, everywhere that
-all others see them; GrabCut runs again within these limits. A single camera has its colours only.
+shoulders are in every picture, even from behind. A network that knows the shapes of people
+(`silhouette.py`) says more closely where they are. GrabCut (Rother, Kolmogorov and Blake 2004)
+finds their outlines by colours; heads of other people close by count as wall. Then the cameras
+correct each other: the person is nowhere that others see past them, and, if they are many,
+everywhere that all others see them; GrabCut runs again within these limits.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ SLACK_PX = (3.0, 1.5)  # of `_corrected_labels`, per round
 COLOURS, RARE = 32, 1e-5  # colour cells along each axis of Lab; share of a cell that is never seen
 UNSEEN = 2 / COLOURS**3  # the person does not have colours of a smaller share
 CLEARLY = 4.0  # ratio of shares from which a colour is the person's, not the wall's
+UNLIKELY, HARDLY = 0.1, 0.01  # chances at which colours count less, and do not count
 CELLS = 96  # cells along each side of the cube in which cameras are compared
 
 
@@ -122,7 +124,7 @@ def cut_out(
         NoFaceError: no camera shows a face.
     """
     place = place or find_head(views)
-    guesses = [_guess(view, place) for view in views]
+    guesses = _guesses(views, place)
     for view, guess in zip(views, guesses, strict=True):
         if view.known is None:
             # Heads and necks of others are wall but where the person surely is, in front of
@@ -130,7 +132,7 @@ def cut_out(
             sure = guess == cv2.GC_FGD
             close = find_neighbours(view, place) if others is None else others.get(view.name, ())
             for other in close:
-                guess[(_guess(view, other) == cv2.GC_FGD) & ~sure] = cv2.GC_BGD
+                guess[(average_person(view, other) == cv2.GC_FGD) & ~sure] = cv2.GC_BGD
                 guess[_head_mask(view, other) & (guess == cv2.GC_PR_BGD)] = cv2.GC_BGD
             if view.wall is not None:
                 guess[view.wall] = cv2.GC_BGD
@@ -142,11 +144,14 @@ def cut_out(
             for view, own, guess, scale in zip(views, labels, guesses, density, strict=True)
         ]
 
-    masks = cut([_with_own_colours(*pair) for pair in zip(views, guesses, strict=True)])
+    starts = guesses
+    if len(views) < MANY:
+        starts = [_with_own_colours(*pair) for pair in zip(views, guesses, strict=True)]
+    masks = cut(starts)
     if ball is not None and len(views) >= FEWEST:
         for slack in SLACK_PX:
             masks = cut(_corrected_labels(views, guesses, masks, ball, slack))
-    bodies = [_guess(view, place, {1: (trunk_of_a_person(),)}) > 0 for view in views]
+    bodies = [average_person(view, place, {1: (trunk_of_a_person(),)}) > 0 for view in views]
     cuts = map(Cut, masks, density, bodies)
     return {view.name: found for view, found in zip(views, cuts, strict=True)}
 
@@ -202,11 +207,37 @@ def find_neighbours(view: CutView, place: HeadPlace) -> list[HeadPlace]:
     return heads[1:]
 
 
+def _guesses(views: Sequence[CutView], place: HeadPlace) -> list[np.ndarray]:
+    """Guess where the person is: GrabCut labels (h, w) uint8 of each view to start from."""
+    from pipelines.matte.silhouette import chances, crop_about, enlarged, network_input
+
+    guesses = [average_person(view, place) for view in views]
+    shown: list[tuple[int, np.ndarray]] = []
+    for k, view in enumerate(views):
+        pixels = place.pixels(chin_and_above(), view.camera)
+        if view.known is None and len(pixels) == 2:
+            shown.append((k, crop_about(pixels[0], pixels[1], place.density(view.camera))))
+    if not shown:
+        return guesses
+    seen = [network_input(views[k].rgb, views[k].valid, guesses[k], m) for k, m in shown]
+    for (k, matrix), chance in zip(shown, chances(seen), strict=True):
+        average, share = guesses[k], enlarged(chance, matrix, guesses[k].shape)
+        # Where an average person is, colours decide unless the network is nearly sure.
+        least = np.where(average == cv2.GC_PR_FGD, UNLIKELY, 0.5)
+        guess = np.where(share > least, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+        guess[(average == cv2.GC_BGD) & (share <= 0.5)] = cv2.GC_BGD
+        if len(views) < MANY:  # many views tell better
+            guess[share < HARDLY], guess[share > 1 - HARDLY] = cv2.GC_BGD, cv2.GC_FGD
+        guess[average == cv2.GC_FGD] = cv2.GC_FGD
+        guesses[k] = np.where(share < 0, average, guess)
+    return guesses
+
+
 def _head_mask(view: CutView, place: HeadPlace) -> np.ndarray:
     """Return where a head and most of its hair are in a view, (h, w) bool."""
     parts = parts_of_a_person()
     head = (parts[cv2.GC_PR_FGD][0], parts[cv2.GC_FGD][-1])
-    return _guess(view, place, {cv2.GC_FGD: head}) == cv2.GC_FGD
+    return average_person(view, place, {cv2.GC_FGD: head}) == cv2.GC_FGD
 
 
 @cache
@@ -237,6 +268,18 @@ def parts_of_a_person() -> dict[int, tuple[np.ndarray, ...]]:
 
 
 @cache
+def chin_and_above() -> np.ndarray:
+    """Return a point inside the head at the chin's height, and one above it, (2, 3) metres."""
+    from express50.head.load import load_builtin
+    from pipelines.calibrate.footage_rig import mean_landmarks
+    from pipelines.matte.silhouette import UP_M
+
+    depth = float(load_builtin().template[:, 2].double().mean())
+    chin = np.array([0, mean_landmarks()[8, 1], depth])
+    return np.array([chin, chin + [0, UP_M, 0]])
+
+
+@cache
 def trunk_of_a_person() -> np.ndarray:
     """Return the corners (N, 3) of a slab about the body below the neck, head space, metres."""
     from express50.head.load import load_builtin
@@ -262,10 +305,10 @@ def _slab(
 
 def region_of(view: CutView, place: HeadPlace) -> np.ndarray:
     """Return where a person may be (h, w) bool in a view, their hair and shoulders included."""
-    return _guess(view, place) != cv2.GC_BGD
+    return average_person(view, place) != cv2.GC_BGD
 
 
-def _guess(
+def average_person(
     view: CutView, place: HeadPlace, parts: Mapping[int, Sequence[np.ndarray]] | None = None
 ) -> np.ndarray:
     """Project a person's parts, or some, into a view: GrabCut labels (h, w) uint8 to start from."""
@@ -309,7 +352,8 @@ def _with_own_colours(view: CutView, guess: np.ndarray) -> np.ndarray:
     """Take what has the head's colours, not the wall's, for the person in a guess (h, w).
 
     GrabCut would learn a ponytail as one more colour of a plain wall. But what runs off a side of
-    the picture that the person does not reach is more likely a floor.
+    the picture that the person does not reach is more likely a floor. With many views this is not
+    needed: they keep ponytails, and it would keep walls of the shirt's colour.
     """
     cells = _cells_of(cv2.GaussianBlur(view.rgb, (0, 0), 1))
     own, wall = (_shares(cells[(guess == v) & view.valid]) for v in (cv2.GC_FGD, cv2.GC_BGD))
