@@ -124,7 +124,7 @@ def cut_out(
         NoFaceError: no camera shows a face.
     """
     place = place or find_head(views)
-    guesses = _guesses(views, place)
+    guesses = guess_person(views, place)
     for view, guess in zip(views, guesses, strict=True):
         if view.known is None:
             # Heads and necks of others are wall but where the person surely is, in front of
@@ -207,7 +207,7 @@ def find_neighbours(view: CutView, place: HeadPlace) -> list[HeadPlace]:
     return heads[1:]
 
 
-def _guesses(views: Sequence[CutView], place: HeadPlace) -> list[np.ndarray]:
+def guess_person(views: Sequence[CutView], place: HeadPlace) -> list[np.ndarray]:
     """Guess where the person is: GrabCut labels (h, w) uint8 of each view to start from."""
     from pipelines.matte.silhouette import chances, crop_about, enlarged, network_input
 
@@ -228,6 +228,9 @@ def _guesses(views: Sequence[CutView], place: HeadPlace) -> list[np.ndarray]:
         guess[(average == cv2.GC_BGD) & (share <= 0.5)] = cv2.GC_BGD
         if len(views) < MANY:  # many views tell better
             guess[share < HARDLY], guess[share > 1 - HARDLY] = cv2.GC_BGD, cv2.GC_FGD
+        else:  # and shirts may have the wall's colour
+            body = average_person(views[k], place, {1: (trunk_of_a_person(),)}) > 0
+            guess[body & (average == cv2.GC_PR_FGD)] = cv2.GC_PR_FGD
         guess[average == cv2.GC_FGD] = cv2.GC_FGD
         guesses[k] = np.where(share < 0, average, guess)
     return guesses

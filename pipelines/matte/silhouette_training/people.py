@@ -59,7 +59,7 @@ def views_of_person(model: HeadModel, number: int) -> list[PersonView]:
     subject = replace(subject, look=replace(subject.look, hair_length_m=length))
     worn = tuple(kind for kind, share in WORN.items() if rng.random() < share)
     detail = 0.0 if rng.random() < BALD else 0.6
-    body = _in_other_clothes(build_body(model, subject, TWIN_SEED, detail, worn), rng)
+    body = in_other_clothes(build_body(model, subject, TWIN_SEED, detail, worn), rng)
     script = select(None)
     chosen = [script[k] for k in rng.choice(len(script), POSES, replace=False)]
     play = perform(model, chosen, 4, 24.0, number, TWIN_SEED)
@@ -72,11 +72,13 @@ def views_of_person(model: HeadModel, number: int) -> list[PersonView]:
         scene = build_scene(body, texture, eyes, light, posed, TWIN_SEED, None)
         head = posed.vertices[: len(model.template)].mean(0)
         pose = play.R[frame], play.t[frame]
-        views += [_view(scene, _camera(head, k < VIEWS / 2, rng), *pose, rng) for k in range(VIEWS)]
+        views += [
+            render(scene, random_camera(head, k < VIEWS / 2, rng), *pose, rng) for k in range(VIEWS)
+        ]
     return views
 
 
-def _in_other_clothes(body: Body, rng: Rng) -> Body:
+def in_other_clothes(body: Body, rng: Rng) -> Body:
     """Make the shirt wider, narrower, deeper, longer, or turned against the head."""
     shirt = body.extras.cloth_vertices.astype(np.float64)
     top, middle, turn = shirt[:, 1].max(), shirt.mean(0), rng.normal() * 0.3
@@ -91,7 +93,7 @@ def _in_other_clothes(body: Body, rng: Rng) -> Body:
     return replace(body, extras=replace(body.extras, cloth_vertices=cloth))
 
 
-def _camera(head: np.ndarray, front: bool, rng: Rng) -> Camera:
+def random_camera(head: np.ndarray, front: bool, rng: Rng) -> Camera:
     """Draw a camera that looks at the chin of a head (3,), world, from anywhere or the front."""
     azimuth = rng.normal() * 0.9 if front else rng.uniform(-np.pi, np.pi)
     height, distance = np.radians(rng.uniform(-25, 35)), rng.uniform(0.6, 2.5)
@@ -104,7 +106,7 @@ def _camera(head: np.ndarray, front: bool, rng: Rng) -> Camera:
     return Camera("view", SIDE, SIDE, "PINHOLE", (focal, focal, SIDE / 2, SIDE / 2), pose)
 
 
-def _view(
+def render(
     scene: LitScene, camera: Camera, turn: np.ndarray, shift: np.ndarray, rng: Rng
 ) -> PersonView:
     """Render a scene whose head has a pose; one band of rows is the whole picture."""

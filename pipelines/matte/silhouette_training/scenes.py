@@ -39,7 +39,7 @@ def draw_scene(view: PersonView, other: PersonView, rng: Rng) -> TrainingScene:
     person = with_hair_and_hat(recoloured(view, rng), view.labels, rng)
     wall = room(colours_of(person, view), rng)
     if rng.random() < 0.08:
-        wall = _before_wall(other, wall, rng)
+        wall = with_somebody_behind(other, wall, rng)
     wall = wall**GAMMA * np.exp(rng.normal() * 0.4)
     if rng.random() < 0.4:  # the person's shadow
         move = np.array([[1, 0, rng.normal() * 12], [0, 1, rng.normal() * 8]])
@@ -49,7 +49,7 @@ def draw_scene(view: PersonView, other: PersonView, rng: Rng) -> TrainingScene:
     light = person.light * np.exp(rng.normal() * 0.5) + wall * (1 - person.alpha[..., None])
     light *= np.exp(rng.normal(size=3) * 0.12)  # white balance
     image = np.clip(light, 0, 1) ** rng.uniform(0.38, 0.55)
-    return _photographed(image.astype(np.float32), person.alpha, view.labels, rng)
+    return photographed(image.astype(np.float32), person.alpha, view.labels, rng)
 
 
 def recoloured(view: PersonView, rng: Rng) -> Layer:
@@ -63,20 +63,20 @@ def recoloured(view: PersonView, rng: Rng) -> Layer:
         return Layer(light, alpha)
     grey = light.mean(-1, keepdims=True) / max(float(light[shirt].mean()), 1e-4)
     if rng.random() < 0.85:
-        light[shirt] = (grey * np.clip(_cloth(rng), 0, 1))[shirt]
+        light[shirt] = (grey * np.clip(cloth_colours(rng), 0, 1))[shirt]
     if rng.random() < 0.25:
         rows, columns = np.nonzero(shirt)
         middle, top = columns.mean() + rng.normal() * 6, rows.min()
         left, right = rng.uniform(4, 25, 2)
         neck = [(middle - left, top), (middle + right, top), (middle, top + rng.uniform(8, 60))]
-        inside = shirt & (_drawn(np.array(neck)) > 0.5)
+        inside = shirt & (filled(np.array(neck)) > 0.5)
         skin = view.material == Material.SKIN
         bare = rng.random() < 0.6 and skin.any()
         light[inside] = (grey * (light[skin].mean(0) if bare else some_light(rng)))[inside]
     return Layer(light, alpha)
 
 
-def _cloth(rng: Rng) -> np.ndarray:
+def cloth_colours(rng: Rng) -> np.ndarray:
     """Draw the colours (S, S, 3) of a plain, striped, checked, mottled or printed cloth."""
     cloth = np.tile(some_light(rng), (SIDE, SIDE, 1)).astype(np.float32)
     kind = rng.random()
@@ -93,7 +93,7 @@ def _cloth(rng: Rng) -> np.ndarray:
         cloth *= 1 + waves(int(rng.integers(5, 80)), 3, rng) * rng.uniform(0.1, 0.7)
     elif kind < 0.65:
         print_ = blob(rng.uniform(0.3, 0.9, 2) * SIDE, rng.uniform(4, 25, 2), 0.2, rng)
-        cloth[_drawn(print_) > 0.5] = some_light(rng)
+        cloth[filled(print_) > 0.5] = some_light(rng)
     return cloth
 
 
@@ -112,39 +112,39 @@ def with_hair_and_hat(person: Layer, labels: np.ndarray, rng: Rng) -> Layer:
         shape = blob(
             at(rng.normal() * 0.06, length / 2 - 0.12), (width, length / 2), 0.12, rng, size
         )
-        person = _painted(person, shape, hair, rng, front=False)
+        person = painted(person, shape, hair, rng, front=False)
         for side in (-1.0, 1.0):
             if rng.random() < 0.3:
                 strand = at(side * rng.uniform(0.32, 0.5), rng.uniform(0.4, 1.3))
                 radii = rng.uniform(0.08, 0.2), rng.uniform(0.4, 1)
-                person = _painted(person, blob(strand, radii, 0.15, rng, size), hair, rng)
+                person = painted(person, blob(strand, radii, 0.15, rng, size), hair, rng)
     if rng.random() < 0.12:
         bun = at(rng.normal() * 0.4, rng.uniform(-0.45, 0.6))
         shape = blob(bun, rng.uniform(0.12, 0.35, 2), 0.15, rng, size)
-        person = _painted(person, shape, hair, rng, front=False)
+        person = painted(person, shape, hair, rng, front=False)
     if rng.random() < 0.12:
         shape = blob(at(0, 0.3), rng.uniform(0.5, 0.85, 2), 0.12, rng, size)
-        person = _painted(person, shape, hair, rng, front=False)
+        person = painted(person, shape, hair, rng, front=False)
     if rng.random() < 0.1:
         colour = some_light(rng)
         shape = blob(at(0, 0.12), rng.uniform(0.42, 0.6, 2), 0.05, rng, size)
         shape[:, 1] = np.minimum(shape[:, 1], top + size * rng.uniform(0.1, 0.3))
-        person = _painted(person, shape, colour, rng)
+        person = painted(person, shape, colour, rng)
         if rng.random() < 0.5:
             brim = blob(at(rng.normal() * 0.4, 0.2), (rng.uniform(0.5, 0.9), 0.07), 0.05, rng, size)
-            person = _painted(person, brim, colour, rng)
+            person = painted(person, brim, colour, rng)
     if rng.random() < 0.05:
         for side in (-0.5, 0.5):
             cup = blob(at(side, 0.55), rng.uniform(0.08, 0.2, 2), 0.05, rng, size)
-            person = _painted(person, cup, some_light(rng) / 2, rng)
+            person = painted(person, cup, some_light(rng) / 2, rng)
     return person
 
 
-def _painted(
+def painted(
     person: Layer, shape: np.ndarray, colour: np.ndarray, rng: Rng, front: bool = True
 ) -> Layer:
     """Paint a shape (N, 2) with streaks, lit from a side, in front of a person or behind."""
-    cover = _drawn(shape)
+    cover = filled(shape)
     streaks = rng.normal(size=(SIDE // 8, SIDE)).astype(np.float32)
     texture = 1 + cv2.resize(streaks, (SIDE, SIDE))[..., None] * rng.uniform(0.05, 0.4)
     light = np.clip(colour * texture, 0, 1.5) * (1 + rng.normal() * 0.3 * X[..., None])
@@ -198,7 +198,7 @@ def blob(
     return centre + circle * np.asarray(radii) * size
 
 
-def _drawn(shape: np.ndarray) -> np.ndarray:
+def filled(shape: np.ndarray) -> np.ndarray:
     """Return how far a polygon (N, 2) covers the pixels (S, S)."""
     cover = np.zeros((SIDE, SIDE), np.float32)
     cv2.fillPoly(cover, [np.int32(shape * 2**FINE)], 1.0, cv2.LINE_AA, FINE)
@@ -214,13 +214,13 @@ def room(own: list[np.ndarray], rng: Rng) -> np.ndarray:
             wall += waves(int(rng.integers(3, 60)), channels, rng) * rng.uniform(0, most)
     things = rng.integers(1, 16) if rng.random() < 0.7 else 0
     for _ in range(things):
-        wall = _with_thing(np.ascontiguousarray(wall, np.float32), own, rng)
+        wall = with_thing(np.ascontiguousarray(wall, np.float32), own, rng)
     if rng.random() < 0.6:  # out of focus
         wall = cv2.GaussianBlur(wall, (0, 0), np.exp(rng.uniform(-1, 1.6)))
     return np.clip(wall, 0, 1)
 
 
-def _with_thing(wall: np.ndarray, own: list[np.ndarray], rng: Rng) -> np.ndarray:
+def with_thing(wall: np.ndarray, own: list[np.ndarray], rng: Rng) -> np.ndarray:
     """Add a board, box, ball or pole to a wall."""
     kind, colour = rng.random(), tuple(map(float, some_colour(rng, own)))
     place, size = rng.uniform(-20, SIDE + 20, 2), np.exp(rng.uniform(1.2, 4.6, 2))
@@ -233,7 +233,7 @@ def _with_thing(wall: np.ndarray, own: list[np.ndarray], rng: Rng) -> np.ndarray
         return cv2.ellipse(wall, place.astype(int), axes, angle, 0, 360, colour, -1, cv2.LINE_AA)
     tilt = rng.normal() * 6 if rng.random() < 0.8 else rng.uniform(0, 90)
     corners = cv2.boxPoints((place.tolist(), size.tolist(), tilt))
-    inside, look = _drawn(corners)[..., None], np.array(colour) * np.ones_like(wall)
+    inside, look = filled(corners)[..., None], np.array(colour) * np.ones_like(wall)
     if rng.random() < 0.6:
         look = look * (1 + rng.normal() * 0.2 * (X if rng.random() < 0.5 else Y))[..., None]
     if rng.random() < 0.3:
@@ -248,7 +248,7 @@ def _with_thing(wall: np.ndarray, own: list[np.ndarray], rng: Rng) -> np.ndarray
     return wall
 
 
-def _before_wall(other: PersonView, wall: np.ndarray, rng: Rng) -> np.ndarray:
+def with_somebody_behind(other: PersonView, wall: np.ndarray, rng: Rng) -> np.ndarray:
     """Put another person, smaller and at a side, before a wall (S, S, 3)."""
     scale, side = rng.uniform(0.5, 1), rng.choice([-1, 1])
     across = (0.5 * (1 - scale) + side * scale * rng.uniform(0.45, 0.9)) * SIDE
@@ -259,7 +259,7 @@ def _before_wall(other: PersonView, wall: np.ndarray, rng: Rng) -> np.ndarray:
     return np.where(rgba[..., 3:] > 0.5, shown, wall)
 
 
-def _photographed(
+def photographed(
     image: np.ndarray, alpha: np.ndarray, labels: np.ndarray, rng: Rng
 ) -> TrainingScene:
     """Turn, mirror, blur and cut a picture (S, S, 3) to what the network sees."""
