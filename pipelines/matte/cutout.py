@@ -226,7 +226,7 @@ def guess_person(views: Sequence[CutView], place: HeadPlace) -> list[np.ndarray]
         least = np.where(average == cv2.GC_PR_FGD, UNLIKELY, 0.5)
         guess = np.where(share > least, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
         guess[(average == cv2.GC_BGD) & (share <= 0.5)] = cv2.GC_BGD
-        if len(views) < MANY:  # many views tell better
+        if len(views) < MANY:  # with many, the other views decide
             guess[share < HARDLY], guess[share > 1 - HARDLY] = cv2.GC_BGD, cv2.GC_FGD
         else:  # and shirts may have the wall's colour
             body = average_person(views[k], place, {1: (trunk_of_a_person(),)}) > 0
