@@ -151,7 +151,7 @@ def cut_out(
     if ball is not None and len(views) >= FEWEST:
         for slack in SLACK_PX:
             masks = cut(_corrected_labels(views, guesses, masks, ball, slack))
-    bodies = [average_person(view, place, {1: (trunk_of_a_person(),)}) > 0 for view in views]
+    bodies = [_body(view, place) for view in views]
     cuts = map(Cut, masks, density, bodies)
     return {view.name: found for view, found in zip(views, cuts, strict=True)}
 
@@ -229,11 +229,15 @@ def guess_person(views: Sequence[CutView], place: HeadPlace) -> list[np.ndarray]
         if len(views) < MANY:  # with many, the other views decide
             guess[share < HARDLY], guess[share > 1 - HARDLY] = cv2.GC_BGD, cv2.GC_FGD
         else:  # and shirts may have the wall's colour
-            body = average_person(views[k], place, {1: (trunk_of_a_person(),)}) > 0
-            guess[body & (average == cv2.GC_PR_FGD)] = cv2.GC_PR_FGD
+            guess[_body(views[k], place) & (average == cv2.GC_PR_FGD)] = cv2.GC_PR_FGD
         guess[average == cv2.GC_FGD] = cv2.GC_FGD
         guesses[k] = np.where(share < 0, average, guess)
     return guesses
+
+
+def _body(view: CutView, place: HeadPlace) -> np.ndarray:
+    """Return where the body below the neck may be in a view, (h, w) bool."""
+    return average_person(view, place, {1: (trunk_of_a_person(),)}) > 0
 
 
 def _head_mask(view: CutView, place: HeadPlace) -> np.ndarray:

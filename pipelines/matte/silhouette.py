@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from express50.errors import FormatError
 from express50.files.arrays import read_arrays
 from express50.geometry.conventions import affine_to_opencv
 from express50.geometry.transforms import scale_of
+from express50.landmarks.network import fold
 
 WEIGHTS = Path(__file__).with_name("silhouette_weights.npz")
 CROP = 128  # side of the network's picture, pixels
@@ -56,13 +56,10 @@ class SilhouetteNet(nn.Module):
             finer.append(y)
         y = y + functional.relu(self.whole(y.mean((2, 3))))[..., None, None]
         for up, other in zip(self.up, finer[-2::-1], strict=True):
-            y = functional.relu(
-                up(torch.cat([functional.interpolate(y, scale_factor=2.0), other], 1))
-            )
-        y = self.last(y)
-        return functional.interpolate(y, scale_factor=2.0, mode="bilinear", align_corners=False)[
-            :, 0
-        ]
+            large = functional.interpolate(y, scale_factor=2.0)
+            y = functional.relu(up(torch.cat([large, other], 1)))
+        y = functional.interpolate(self.last(y), scale_factor=2.0, mode="bilinear")
+        return y[:, 0]
 
 
 def _conv(inputs: int, outputs: int, stride: int) -> nn.Sequential:
@@ -127,24 +124,17 @@ def enlarged(chance: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> n
 
 def save_silhouettes(net: SilhouetteNet, path: Path) -> None:
     """Write a trained network as float16, with batch normalisations folded into convolutions."""
-    arrays = {key: value.half().numpy() for key, value in folded(net).state_dict().items()}
+    fold(net.eval())
+    arrays = {key: value.half().numpy() for key, value in net.state_dict().items()}
     with path.open("wb") as file:
         np.savez_compressed(file, **arrays)
-
-
-def folded(net: SilhouetteNet) -> SilhouetteNet:
-    """Fold a network's batch normalisations, in place, and return it for evaluation."""
-    net = net.eval()
-    for layers in (net.down, net.same, net.up):
-        for k, layer in enumerate(layers):
-            layers[k] = fuse_conv_bn_eval(layer[0], layer[1])
-    return net
 
 
 @lru_cache(maxsize=1)
 def load_silhouettes(path: Path = WEIGHTS) -> SilhouetteNet:
     """Read weights written by `save_silhouettes`; FormatError if they are missing or damaged."""
-    net = folded(SilhouetteNet())
+    net = SilhouetteNet().eval()
+    fold(net)
     arrays = read_arrays(path, FormatError, "silhouette weights", list(net.state_dict()))
     net.load_state_dict({key: torch.from_numpy(v.astype(np.float32)) for key, v in arrays.items()})
     return net.to(memory_format=torch.channels_last)
