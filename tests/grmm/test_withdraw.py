@@ -4,10 +4,9 @@ import pytest
 import torch
 
 from express50.errors import ConfigError, FormatError
-from grmm.checkpoint import load_checkpoint, read_content
+from grmm.checkpoint import load_checkpoint, read_content, redact
 from grmm.edit import trained_head
 from grmm.train import train
-from grmm.withdraw import redact
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 

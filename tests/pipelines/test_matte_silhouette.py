@@ -24,8 +24,7 @@ from pipelines.matte.silhouette import (
     save_silhouettes,
 )
 from pipelines.matte.silhouette_training import train
-from pipelines.matte.silhouette_training.people import PersonView, draw_people
-from pipelines.matte.silhouette_training.scenes import draw_scene
+from pipelines.matte.silhouette_training.scenes import PersonView, draw_people, draw_scene
 
 UNSEEN = 9000  # training's people have lower numbers
 

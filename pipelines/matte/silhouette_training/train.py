@@ -22,8 +22,12 @@ from express50.head.load import load_head
 from express50.landmarks.training.descent import minimise
 from express50.landmarks.training.views import made_once
 from pipelines.matte.silhouette import WEIGHTS, SilhouetteNet, save_silhouettes
-from pipelines.matte.silhouette_training.people import PersonView, draw_people
-from pipelines.matte.silhouette_training.scenes import TrainingScene, draw_scene
+from pipelines.matte.silhouette_training.scenes import (
+    PersonView,
+    TrainingScene,
+    draw_people,
+    draw_scene,
+)
 
 FIRST, FILE_PEOPLE = 5000, 40  # number of the first person; people per file
 BATCH, RATE = 16, 2e-3
