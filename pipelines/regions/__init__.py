@@ -82,7 +82,7 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result
 
 STAGE = Stage(
     name="regions",
-    version=21,
+    version=22,
     config=RegionsConfig,
     items=tracked_items,
     inputs=inputs,

@@ -80,7 +80,7 @@ UPPER_FACE, LOWER_FACE = (-0.6, 0.45), (0.6, 1.4)
 PLEATS = np.array([0.6, 0.12, 0.12])  # most by which a mask's pixels differ from its usual colour
 MASK_REACH_M = 0.08  # from the lips
 COHERENT = 0.75  # share of a face near its middle colour below which a fringe may cover it
-BARE = 0.7  # share of the scalp in the face's colours, over the same of the face, of bare scalps
+BARE = 0.6  # share of the scalp in the face's colours, over the same of the face, of bare scalps
 
 
 def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.ndarray | None:

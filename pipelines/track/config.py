@@ -10,7 +10,7 @@ from express50.contract.config import check_ranges
 from express50.errors import ConfigError
 from express50.head import BUILTIN_NAME, absolute_head
 
-VERSION = 33
+VERSION = 34
 UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")
 
 

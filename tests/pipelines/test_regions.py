@@ -205,6 +205,17 @@ def test_a_bald_scalp_is_recognised_by_its_colours() -> None:
     assert judge_scalp([]).skin_coloured is None and not judge_scalp([]).is_skin
 
 
+def test_headphones_over_a_third_of_a_bald_scalp_are_not_its_hair() -> None:
+    scene = make_scene(0, hair=False)
+    mesh = render_head(scene.head, scene.camera)[0]
+    columns = np.argsort(np.argwhere(mesh == SCALP)[:, 1], kind="stable")
+    band = np.argwhere(mesh == SCALP)[columns[: round(0.35 * len(columns))]]
+    rgb = scene.rgb.copy()
+    rgb[tuple(band.T)] = (150, 150, 155)
+    scalp = judge_scalp([scalp_votes(rgb, mesh, scene.alpha)])
+    assert scalp.is_skin and 0.6 < scalp.skin_coloured < 0.7
+
+
 def test_the_beard_of_a_bald_head_in_light_from_one_side_is_hair() -> None:
     """Skin in the shade is as dark as the beard."""
     scene = make_scene(0, size=300, hair=False)
