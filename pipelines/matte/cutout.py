@@ -47,7 +47,8 @@ SLACK_PX = (3.0, 1.5)  # of `_corrected_labels`, per round
 COLOURS, RARE = 32, 1e-5  # colour cells along each axis of Lab; share of a cell that is never seen
 UNSEEN = 2 / COLOURS**3  # the person does not have colours of a smaller share
 CLEARLY = 4.0  # ratio of shares from which a colour is the person's, not the wall's
-UNLIKELY, HARDLY = 0.1, 0.01  # chances at which colours count less, and do not count
+# Chances of the network at which colours count less, do not count except on bodies, and do not.
+UNLIKELY, SELDOM, HARDLY = 0.1, 0.05, 0.01
 CELLS = 96  # cells along each side of the cube in which cameras are compared
 
 
@@ -222,14 +223,19 @@ def guess_person(views: Sequence[CutView], place: HeadPlace) -> list[np.ndarray]
     seen = [network_input(views[k].rgb, views[k].valid, guesses[k], m) for k, m in shown]
     for (k, matrix), chance in zip(shown, chances(seen), strict=True):
         average, share = guesses[k], enlarged(chance, matrix, guesses[k].shape)
+        body = _body(views[k], place)
         # Where an average person is, colours decide unless the network is nearly sure.
         least = np.where(average == cv2.GC_PR_FGD, UNLIKELY, 0.5)
         guess = np.where(share > least, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
         guess[(average == cv2.GC_BGD) & (share <= 0.5)] = cv2.GC_BGD
-        if len(views) < MANY:  # with many, the other views decide
+        # Shirts may have the wall's colour, so that the network misses them: there it decides only
+        # if it is surer, and with many views not at all.
+        guess[(share < SELDOM) & ~body] = cv2.GC_BGD
+        if len(views) < MANY:
             guess[share < HARDLY], guess[share > 1 - HARDLY] = cv2.GC_BGD, cv2.GC_FGD
-        else:  # and shirts may have the wall's colour
-            guess[_body(views[k], place) & (average == cv2.GC_PR_FGD)] = cv2.GC_PR_FGD
+        else:
+            guess[(share > 1 - SELDOM) & ~body] = cv2.GC_FGD
+            guess[body & (average == cv2.GC_PR_FGD)] = cv2.GC_PR_FGD
         guess[average == cv2.GC_FGD] = cv2.GC_FGD
         guesses[k] = np.where(share < 0, average, guess)
     return guesses

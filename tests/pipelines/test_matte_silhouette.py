@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from express50.errors import FormatError
-from express50.geometry.transforms import transform_points
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import look_at, transform_points
 from express50.head.load import load_head
 from pipelines.matte import silhouette
+from pipelines.matte.cutout import (
+    CutView,
+    HeadPlace,
+    average_person,
+    chin_and_above,
+    guess_person,
+    trunk_of_a_person,
+)
 from pipelines.matte.silhouette import (
     CROP,
     SPAN_M,
@@ -61,6 +71,36 @@ def test_chances_come_back_to_their_pixels_and_are_negative_elsewhere() -> None:
     found = enlarged(chance, matrix, (300, 400))
     assert (found[:79, 60:140][17:] == 1).all() and (found[81:140, 60:140] == 0).all()
     assert (found[:, 200:] == -1).all()
+
+
+@pytest.mark.parametrize(
+    ("views", "chance", "on_head", "on_body"),
+    [
+        (3, 0.03, cv2.GC_BGD, cv2.GC_PR_BGD),  # few cameras: sure about heads, not about bodies
+        (3, 0.003, cv2.GC_BGD, cv2.GC_BGD),
+        (3, 0.97, cv2.GC_PR_FGD, cv2.GC_PR_FGD),
+        (8, 0.03, cv2.GC_BGD, cv2.GC_PR_FGD),  # many cameras: they decide about bodies
+        (8, 0.97, cv2.GC_FGD, cv2.GC_PR_FGD),
+    ],
+)
+def test_the_network_decides_about_heads_sooner_than_about_bodies(
+    views: int, chance: float, on_head: int, on_body: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pose = look_at(np.array([0.0, 0.0, 1.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    camera = Camera("front", 256, 256, "PINHOLE", (300.0, 300.0, 128.0, 128.0), pose)
+    view = CutView(camera, np.zeros((256, 256, 3), np.uint8), np.ones((256, 256), bool))
+    place = HeadPlace(1.0, np.eye(3), np.zeros(3))
+    monkeypatch.setattr(
+        silhouette, "chances", lambda inputs: np.full((len(inputs), CROP, CROP), chance, np.float32)
+    )
+    chin, above = place.pixels(chin_and_above(), camera)
+    crop = crop_about(chin, above, place.density(camera))
+    shown = enlarged(np.ones((CROP, CROP), np.float32), crop, view.valid.shape) > 0
+    likely = (average_person(view, place) == cv2.GC_PR_FGD) & shown
+    body = average_person(view, place, {1: (trunk_of_a_person(),)}) > 0
+    for guess in guess_person([view] * views, place):
+        assert (likely & ~body).sum() > 500 and (guess[likely & ~body] == on_head).all()
+        assert (likely & body).sum() > 500 and (guess[likely & body] == on_body).all()
 
 
 def test_damaged_weights_are_named(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ PLACE_M, SIZE = 0.006, 0.04  # errors of the head's place: metres, and logarithm
 EMPTY = 255
 GAMMA = 2.2
 FINE = 4  # fractional bits of OpenCV's drawing coordinates
+MOST_THINGS = 3.9  # logarithm of the most things in a room
 X, Y = np.meshgrid(np.linspace(-1, 1, SIDE), np.linspace(-1, 1, SIDE))
 Rng = np.random.Generator
 
@@ -238,6 +239,13 @@ def with_hair_and_hat(person: Layer, labels: np.ndarray, rng: Rng) -> Layer:
         bun = at(rng.normal() * 0.4, rng.uniform(-0.45, 0.6))
         shape = blob(bun, rng.uniform(0.12, 0.35, 2), 0.15, rng, size)
         person = painted(person, shape, hair, rng, front=False)
+    if rng.random() < 0.12:  # a ponytail
+        tail = at(rng.choice([-1, 1]) * rng.uniform(0.3, 0.75), rng.uniform(0.3, 1.2))
+        radii = rng.uniform(0.06, 0.2), rng.uniform(0.25, 0.8)
+        person = painted(person, blob(tail, radii, 0.15, rng, size), hair, rng, front=False)
+    if rng.random() < 0.1:  # a hood or collar
+        shape = blob(at(0, rng.uniform(0.9, 1.4)), rng.uniform(0.35, 0.9, 2), 0.12, rng, size)
+        person = painted(person, shape, some_light(rng), rng, front=False)
     if rng.random() < 0.12:
         shape = blob(at(0, 0.3), rng.uniform(0.5, 0.85, 2), 0.12, rng, size)
         person = painted(person, shape, hair, rng, front=False)
@@ -301,6 +309,14 @@ def waves(cells: int, channels: int, rng: Rng) -> np.ndarray:
     return large.reshape(SIDE, SIDE, channels)
 
 
+def clouds(rng: Rng) -> np.ndarray:
+    """Draw noise (S, S, 3) whose strength falls with frequency, as in foliage or posters."""
+    fall, grey = rng.uniform(0.3, 1.3), rng.random()
+    cells = [2, 4, 8, 16, 32, 64]
+    noise = sum(((1 - grey) * waves(n, 3, rng) + grey * waves(n, 1, rng)) * n**-fall for n in cells)
+    return np.asarray(noise * np.exp(rng.uniform(-3, -1)) / np.std(noise))
+
+
 def blob(
     centre: np.ndarray, radii: tuple[float, float] | np.ndarray, rough: float, rng: Rng,
     size: float = 1.0,
@@ -328,8 +344,10 @@ def room(own: list[np.ndarray], rng: Rng) -> np.ndarray:
     for channels, share, most in ((1, 0.5, 0.06), (3, 0.25, 0.08)):
         if rng.random() < share:
             wall += waves(int(rng.integers(3, 60)), channels, rng) * rng.uniform(0, most)
-    things = rng.integers(1, 16) if rng.random() < 0.7 else 0
-    for _ in range(things):
+    if rng.random() < 0.25:
+        wall += clouds(rng)
+    things = np.exp(rng.uniform(0, MOST_THINGS)) if rng.random() < 0.7 else 0
+    for _ in range(round(things)):
         wall = with_thing(np.ascontiguousarray(wall, np.float32), own, rng)
     if rng.random() < 0.6:  # out of focus
         wall = cv2.GaussianBlur(wall, (0, 0), np.exp(rng.uniform(-1, 1.6)))
@@ -380,10 +398,11 @@ def photographed(
 ) -> TrainingScene:
     """Turn, mirror, blur and cut a picture (S, S, 3) to what the network sees."""
     scale = CROP / SIDE * VIEW_M / SPAN_M * np.exp(rng.normal() * 0.07)
-    move = cv2.getRotationMatrix2D((SIDE / 2, SIDE / 2), rng.normal() * 6, scale)
+    middle = (SIDE - 1) / 2  # of the cells' centres, as OpenCV counts them
+    move = cv2.getRotationMatrix2D((middle, middle), rng.normal() * 6, scale)
     move[:, 2] += (CROP - SIDE) / 2 + rng.normal(size=2) * 3
     if rng.random() < 0.5:
-        move = np.diag([-1.0, 1.0]) @ move + [[0, 0, CROP], [0, 0, 0]]
+        move = np.diag([-1.0, 1.0]) @ move + [[0, 0, CROP - 1], [0, 0, 0]]
 
     def warped(array: np.ndarray, way: int = cv2.INTER_LINEAR) -> np.ndarray:
         size, rim = (CROP, CROP), cv2.BORDER_REPLICATE

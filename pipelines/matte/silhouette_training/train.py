@@ -64,7 +64,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m pipelines.matte.silhouette_training.train")
     parser.add_argument("--views", type=Path, required=True, help="folder for rendered people")
     parser.add_argument("--files", type=int, default=16, help=f"of {FILE_PEOPLE} people each")
-    parser.add_argument("--steps", type=int, default=7000, help=f"batches of {BATCH} pictures")
+    parser.add_argument("--steps", type=int, default=14000, help=f"batches of {BATCH} pictures")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     options = parser.parse_args(arguments)
