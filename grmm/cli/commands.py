@@ -363,11 +363,15 @@ def _split(
         return known, unseen
     if not known:
         raise ConfigError(
-            f"{args.shards}: the model was not trained on {', '.join(unseen) or args.expressions}; "
-            "give --fit-cameras to fit such people first"
+            f"{args.shards}: the checkpoint has no codes of "
+            f"{', '.join(unseen) or args.expressions}; "
+            "give --fit-cameras, with a checkpoint of 'grmm train', to fit such people first"
         )
     if unseen:
-        log(f"left out {', '.join(unseen)}, whom training did not see: --fit-cameras fits them")
+        log(
+            f"left out {', '.join(unseen)}, of whom the checkpoint has no codes: "
+            "--fit-cameras fits them from a checkpoint of 'grmm train'"
+        )
     return known, {}
 
 

@@ -238,11 +238,14 @@ def test_people_who_are_known_or_left_out_are_named(checkpoint, shards, tmp_path
     evaluate = ["evaluate", str(checkpoint), str(shards), str(tmp_path / "e"), "--images=1"]
     assert main(evaluate) == 0
     said = capsys.readouterr()
-    assert "left out S002, whom training did not see" in said.err
+    assert "left out S002, of whom the checkpoint has no codes" in said.err
     header, row, *_ = said.out.splitlines()
     assert header.split()[:4] == ["views", "images", "PSNR,", "dB"] and row.split()[2] == "1"
     assert "will be replaced" not in said.err
     evaluate[1] = str(tmp_path / "f" / "checkpoint.pt")
+    assert main(evaluate) == 0
+    said = capsys.readouterr().err
+    assert "left out S000, S002" in said and "training did not see" not in said
     assert main([*evaluate, "--fit-cameras=cam00", "--fit-expression=e0"]) == 0
     said = capsys.readouterr().err
     assert "e: its evaluation will be replaced; to keep it, stop and name" in said
