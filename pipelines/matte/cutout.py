@@ -47,9 +47,8 @@ SLACK_PX = (3.0, 1.5)  # of `_corrected_labels`, per round
 COLOURS, RARE = 32, 1e-5  # colour cells along each axis of Lab; share of a cell that is never seen
 UNSEEN = 2 / COLOURS**3  # the person does not have colours of a smaller share
 CLEARLY = 4.0  # ratio of shares from which a colour is the person's, not the wall's
-# Chances of the network, or one less them, at which colours count less, and what it says counts
-# beside bodies, for bodies, and everywhere.
-UNLIKELY, SELDOM, RARELY, HARDLY = 0.1, 0.05, 0.02, 0.01
+# Chances of the network at which colours count less, do not count except on bodies, and do not.
+UNLIKELY, SELDOM, HARDLY = 0.1, 0.05, 0.01
 CELLS = 96  # cells along each side of the cube in which cameras are compared
 
 
@@ -126,8 +125,7 @@ def cut_out(
         NoFaceError: no camera shows a face.
     """
     place = place or find_head(views)
-    bodies = [_body(view, place) for view in views]
-    guesses = guess_person(views, place, bodies)
+    guesses = guess_person(views, place)
     for view, guess in zip(views, guesses, strict=True):
         if view.known is None:
             # Heads and necks of others are wall but where the person surely is, in front of
@@ -153,7 +151,8 @@ def cut_out(
     masks = cut(starts)
     if ball is not None and len(views) >= FEWEST:
         for slack in SLACK_PX:
-            masks = cut(_corrected_labels(views, guesses, bodies, masks, ball, slack))
+            masks = cut(_corrected_labels(views, guesses, masks, ball, slack))
+    bodies = [_body(view, place) for view in views]
     cuts = map(Cut, masks, density, bodies)
     return {view.name: found for view, found in zip(views, cuts, strict=True)}
 
@@ -209,13 +208,8 @@ def find_neighbours(view: CutView, place: HeadPlace) -> list[HeadPlace]:
     return heads[1:]
 
 
-def guess_person(
-    views: Sequence[CutView], place: HeadPlace, bodies: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """Guess where the person is: GrabCut labels (h, w) uint8 of each view to start from.
-
-    `bodies` (h, w) bool are where the body below the neck may be.
-    """
+def guess_person(views: Sequence[CutView], place: HeadPlace) -> list[np.ndarray]:
+    """Guess where the person is: GrabCut labels (h, w) uint8 of each view to start from."""
     from pipelines.matte.silhouette import chances, crop_about, enlarged, network_input
 
     guesses = [average_person(view, place) for view in views]
@@ -229,17 +223,19 @@ def guess_person(
     seen = [network_input(views[k].rgb, views[k].valid, guesses[k], m) for k, m in shown]
     for (k, matrix), chance in zip(shown, chances(seen), strict=True):
         average, share = guesses[k], enlarged(chance, matrix, guesses[k].shape)
-        body = bodies[k]
+        body = _body(views[k], place)
         # Where an average person is, colours decide unless the network is nearly sure.
         least = np.where(average == cv2.GC_PR_FGD, UNLIKELY, 0.5)
         guess = np.where(share > least, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
         guess[(average == cv2.GC_BGD) & (share <= 0.5)] = cv2.GC_BGD
+        # Shirts may have the wall's colour, so that the network misses them: there it decides only
+        # if it is surer, and with many views not at all.
         guess[(share < SELDOM) & ~body] = cv2.GC_BGD
         if len(views) < MANY:
             guess[share < HARDLY], guess[share > 1 - HARDLY] = cv2.GC_BGD, cv2.GC_FGD
-        else:  # shirts may have the wall's colour; where the network misses them, others see them
+        else:
+            guess[(share > 1 - SELDOM) & ~body] = cv2.GC_FGD
             guess[body & (average == cv2.GC_PR_FGD)] = cv2.GC_PR_FGD
-            guess[share > np.where(body, 1 - RARELY, 1 - SELDOM)] = cv2.GC_FGD
         guess[average == cv2.GC_FGD] = cv2.GC_FGD
         guesses[k] = np.where(share < 0, average, guess)
     return guesses
@@ -386,7 +382,6 @@ def _with_own_colours(view: CutView, guess: np.ndarray) -> np.ndarray:
 def _corrected_labels(
     views: Sequence[CutView],
     guesses: Sequence[np.ndarray],
-    bodies: Sequence[np.ndarray],
     masks: Sequence[np.ndarray],
     ball: Ball,
     slack: float,
@@ -404,25 +399,22 @@ def _corrected_labels(
     seen = [evidence_of(matte, space, place) for matte in mattes]
     sure = [one.solid | (guess == cv2.GC_FGD) for one, guess in zip(seen, guesses, strict=True)]
     foreign = _foreign(mattes, sure)
-    rows = zip(mattes, seen, guesses, bodies, foreign, strict=True)
+    rows = zip(mattes, seen, guesses, foreign, strict=True)
     return [_labels(*row, many=len(views) >= MANY) for row in rows]
 
 
 def _labels(
-    view: MatteView, evidence: Evidence, guess: np.ndarray, body: np.ndarray, foreign: np.ndarray,
-    many: bool,
-) -> np.ndarray:  # fmt: skip
+    view: MatteView, evidence: Evidence, guess: np.ndarray, foreign: np.ndarray, many: bool
+) -> np.ndarray:
     """Return GrabCut labels (h, w) from a view's mask, the other views' evidence, and the guess.
 
     GrabCut learns the person's colours where no other view sees the wall and no pixel is `foreign`
     (h, w). Large foreign patches are labelled wall. What all others see as the person is certain
-    only if they are `many`, as is what the guess is certain of on the `body` (h, w); else it is
-    likely where the guess has a person as well.
+    only if they are `many`; else it is likely where the guess has a person as well.
     """
     solid, certain = evidence.solid, guess == cv2.GC_FGD
     if many:
         sure = cv2.erode(solid.astype(np.uint8), np.ones((5, 5))) > 0
-        sure |= certain & body & view.valid  # others may have lost a shirt of the wall's colour too
     else:
         sure = certain & view.valid
         solid = solid & ~foreign & (certain | (guess == cv2.GC_PR_FGD))

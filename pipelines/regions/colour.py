@@ -45,9 +45,6 @@ SURE_BELOW, SURE_ABOVE = -0.01, 0.10
 STRAND_M, WISP_M = 0.005, 0.02
 # Skin apart from the head that covers less than this share of it is a speck of the torso.
 SPECK = 0.02
-# Spots of hair on a face that are smaller than this and touch no other hair are nostrils, lashes
-# and the mouth's corners; a moustache is larger.
-SPOT_M2 = 2.5e-4
 
 # Log-priors by place, nats: UNLIKELY marks what occurs at edges, IMPOSSIBLE what cannot be.
 UNLIKELY, IMPOSSIBLE = -1.0, -20.0
@@ -390,21 +387,18 @@ def label_by_colour(
     skin_label = np.where(kept, geometry.near, SKIN)
     unsure = (geometry.mesh == 0) | np.isin(geometry.mesh, list(_ON_MESH))
     labels = np.where(unsure, np.choose(best, [HAIR, skin_label, TORSO]), labels).astype(np.uint8)
-    # In noise, shirts have single pixels in the colours of skin.
     specks = unsure & (best == 1) & _small_parts((labels != TORSO) & (alpha > 0))
-    spots = _small_parts((labels == HAIR) & (alpha > 0), SPOT_M2 * metre_px**2)
-    labels = np.where(spots & (geometry.mesh == SKIN), SKIN, labels)
     return np.where(specks, TORSO, labels)
 
 
-def _small_parts(mask: np.ndarray, least: float | None = None) -> np.ndarray:
-    """Find the connected parts (H, W) of a mask (H, W) bool with less than `least` pixels.
+def _small_parts(head: np.ndarray) -> np.ndarray:
+    """Find the parts (H, W) of the head (H, W) bool that are apart and small.
 
-    By default, that is SPECK of its largest part.
+    In noise, shirts have single pixels in the colours of skin.
     """
-    _, part, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    _, part, stats, _ = cv2.connectedComponentsWithStats(head.astype(np.uint8), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA]
-    return mask & (area < (SPECK * area[1:].max(initial=0) if least is None else least))[part]
+    return head & (area < SPECK * area[1:].max(initial=0))[part]
 
 
 def _loose(hair: np.ndarray, above: np.ndarray, metre_px: float) -> np.ndarray:

@@ -129,22 +129,6 @@ def test_a_speck_of_shirt_in_the_colour_of_skin_is_torso() -> None:
     assert label_mask(labels, "torso")[specks].all()
 
 
-def test_dark_nostrils_are_skin_and_a_moustache_is_hair() -> None:
-    scene = make_scene(0, size=320)
-    lips = np.argwhere(label_mask(scene.labels, "lips"))
-    row, column = lips[:, 0].min(), round(lips[:, 1].mean())
-    moustache, nostrils = np.zeros_like(scene.labels), np.zeros_like(scene.labels)
-    cv2.rectangle(moustache, (column - 20, row - 7), (column + 20, row - 2), 1, -1)
-    for x in (column - 8, column + 8):
-        cv2.rectangle(nostrils, (x - 3, row - 17), (x + 3, row - 14), 1, -1)
-    noise = np.random.default_rng(2).normal(0, 4, scene.rgb.shape)
-    dark = np.clip(np.array(COLOURS["hair"]) + noise, 0, 255)
-    painted = (moustache | nostrils)[..., None] > 0
-    labels = labels_of(replace(scene, rgb=np.where(painted, dark, scene.rgb).astype(np.uint8)))
-    assert label_mask(labels, "skin")[nostrils > 0].all()
-    assert label_mask(labels, "hair")[moustache > 0].mean() > 0.95
-
-
 def test_without_colours_the_necks_end_still_takes_most_of_the_torso_away() -> None:
     scene = make_scene(0)
     true_head = label_mask(scene.labels, *HEAD)
