@@ -1,4 +1,4 @@
-"""Read and write checkpoints: the model, its configuration and the whole state of the loop.
+"""Read and write checkpoints (model, configuration, state of the loop), and remove people.
 
 Writes are atomic. Reads use ``weights_only``, so nothing in a checkpoint is executed.
 """

@@ -47,7 +47,7 @@ SLACK_PX = (3.0, 1.5)  # of `_corrected_labels`, per round
 COLOURS, RARE = 32, 1e-5  # colour cells along each axis of Lab; share of a cell that is never seen
 UNSEEN = 2 / COLOURS**3  # the person does not have colours of a smaller share
 CLEARLY = 4.0  # ratio of shares from which a colour is the person's, not the wall's
-# Chances of the network at which colours count less, do not count except on bodies, and do not.
+# Chances of the network below which colours count less, count on bodies alone, and do not count.
 UNLIKELY, SELDOM, HARDLY = 0.1, 0.05, 0.01
 CELLS = 96  # cells along each side of the cube in which cameras are compared
 
@@ -125,7 +125,8 @@ def cut_out(
         NoFaceError: no camera shows a face.
     """
     place = place or find_head(views)
-    guesses = guess_person(views, place)
+    bodies = [_body(view, place) for view in views]
+    guesses = guess_person(views, place, bodies)
     for view, guess in zip(views, guesses, strict=True):
         if view.known is None:
             # Heads and necks of others are wall but where the person surely is, in front of
@@ -152,7 +153,6 @@ def cut_out(
     if ball is not None and len(views) >= FEWEST:
         for slack in SLACK_PX:
             masks = cut(_corrected_labels(views, guesses, masks, ball, slack))
-    bodies = [_body(view, place) for view in views]
     cuts = map(Cut, masks, density, bodies)
     return {view.name: found for view, found in zip(views, cuts, strict=True)}
 
@@ -208,8 +208,13 @@ def find_neighbours(view: CutView, place: HeadPlace) -> list[HeadPlace]:
     return heads[1:]
 
 
-def guess_person(views: Sequence[CutView], place: HeadPlace) -> list[np.ndarray]:
-    """Guess where the person is: GrabCut labels (h, w) uint8 of each view to start from."""
+def guess_person(
+    views: Sequence[CutView], place: HeadPlace, bodies: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Guess where the person is: GrabCut labels (h, w) uint8 of each view to start from.
+
+    `bodies` (h, w) bool are where the body below the neck may be.
+    """
     from pipelines.matte.silhouette import chances, crop_about, enlarged, network_input
 
     guesses = [average_person(view, place) for view in views]
@@ -222,8 +227,8 @@ def guess_person(views: Sequence[CutView], place: HeadPlace) -> list[np.ndarray]
         return guesses
     seen = [network_input(views[k].rgb, views[k].valid, guesses[k], m) for k, m in shown]
     for (k, matrix), chance in zip(shown, chances(seen), strict=True):
-        average, share = guesses[k], enlarged(chance, matrix, guesses[k].shape)
-        body = _body(views[k], place)
+        average, body = guesses[k], bodies[k]
+        share = enlarged(chance, matrix, average.shape)
         # Where an average person is, colours decide unless the network is nearly sure.
         least = np.where(average == cv2.GC_PR_FGD, UNLIKELY, 0.5)
         guess = np.where(share > least, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)

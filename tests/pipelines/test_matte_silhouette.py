@@ -98,7 +98,7 @@ def test_the_network_decides_about_heads_sooner_than_about_bodies(
     shown = enlarged(np.ones((CROP, CROP), np.float32), crop, view.valid.shape) > 0
     likely = (average_person(view, place) == cv2.GC_PR_FGD) & shown
     body = average_person(view, place, {1: (trunk_of_a_person(),)}) > 0
-    for guess in guess_person([view] * views, place):
+    for guess in guess_person([view] * views, place, [body] * views):
         assert (likely & ~body).sum() > 500 and (guess[likely & ~body] == on_head).all()
         assert (likely & body).sum() > 500 and (guess[likely & body] == on_body).all()
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from express50.capture.expressions import select
 from express50.geometry.cameras import Camera
+from express50.geometry.conventions import affine_to_opencv
 from express50.geometry.transforms import look_at
 from express50.head.model import HeadModel
 from express50.twin.body import Body, build_body, pose_body, with_hand
@@ -398,11 +399,11 @@ def photographed(
 ) -> TrainingScene:
     """Turn, mirror, blur and cut a picture (S, S, 3) to what the network sees."""
     scale = CROP / SIDE * VIEW_M / SPAN_M * np.exp(rng.normal() * 0.07)
-    middle = (SIDE - 1) / 2  # of the cells' centres, as OpenCV counts them
-    move = cv2.getRotationMatrix2D((middle, middle), rng.normal() * 6, scale)
+    move = cv2.getRotationMatrix2D((SIDE / 2, SIDE / 2), rng.normal() * 6, scale)
     move[:, 2] += (CROP - SIDE) / 2 + rng.normal(size=2) * 3
     if rng.random() < 0.5:
-        move = np.diag([-1.0, 1.0]) @ move + [[0, 0, CROP - 1], [0, 0, 0]]
+        move = np.diag([-1.0, 1.0]) @ move + [[0, 0, CROP], [0, 0, 0]]
+    move = affine_to_opencv(move)
 
     def warped(array: np.ndarray, way: int = cv2.INTER_LINEAR) -> np.ndarray:
         size, rim = (CROP, CROP), cv2.BORDER_REPLICATE
