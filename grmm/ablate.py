@@ -106,11 +106,12 @@ class Ablation:
         source = open_shards(self.test or self.roots, "*")
         trained = {key.subject for key in open_shards(self.roots, "train").keys}
         known = {key.subject for key in source.keys}
+        check_known("--fit-subjects", "person", self.subjects, sorted(known))
         people = list(self.subjects) or sorted(known if self.test else known - trained)
         if both := sorted(trained.intersection(people)):
             raise ConfigError(
-                f"{', '.join(both)} are also trained on; expected people that training does not"
-                " see: choose others (--fit-subjects) or shards of others (--test)"
+                f"training also sees {', '.join(both)}; expected people that it does not see:"
+                " choose others (--fit-subjects) or shards of others (--test)"
             )
         return source, people
 

@@ -146,8 +146,9 @@ def controlled(
             (amount,), code = _numbers(values, 1, name), getattr(head, table)
             moved = amount * code
             if entry:
-                directions = principal_directions(getattr(loaded.model, table))
-                what = "principal directions of the training codes"
+                codes = getattr(loaded.model, table)
+                directions = principal_directions(codes)
+                what = f"principal directions of {count(len(codes), 'training code')}"
                 number = _entry(entry, len(directions), name, what)
                 moved = code + amount * directions[number]
             head = replace(head, **{table: moved})
@@ -261,17 +262,19 @@ def _numbers(values: Sequence[float], size: int, name: str) -> Sequence[float]:
     return values
 
 
-def _entry(text: str, count: int, name: str, what: str, names: Sequence[str] = ()) -> int:
+def _entry(text: str, size: int, name: str, what: str, names: Sequence[str] = ()) -> int:
     if text in names:
         return names.index(text)
-    if text.isdecimal() and int(text) < count:
+    if text.isdecimal() and int(text) < size:
         return int(text)
-    expected = f"expected 0 to {count - 1}" if count else "one person or expression has none"
+    expected = f"expected 0 to {size - 1}" if size > 1 else "expected 0"
+    if not size:
+        expected = "one person or expression has none"
     if names:
         alike = [known for known in names if text.casefold() in known.casefold()]
         expected += f", or a name such as {few(alike or names)}"
         expected += nearest(text, names) or _joint_hint(text)
-    raise ConfigError(f"control {name!r} is none of the {count} {what}; {expected}")
+    raise ConfigError(f"control {name!r} is none of the {what} ({size}); {expected}")
 
 
 def _joint_hint(text: str) -> str:

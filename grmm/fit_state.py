@@ -24,6 +24,7 @@ from grmm.train_state import CHANGEABLE, differences, refuse_changes
 
 Scores = dict[str, float | None]
 FIT = "fit"  # name of its state in a checkpoint's loop
+TRAINING = "training_"  # in a fit, before the names of training's cameras
 
 
 @dataclass(kw_only=True)
@@ -89,6 +90,12 @@ def start(loaded: Checkpoint, views: HeadViews, given: list[int]) -> FitState:
         perceptual=losses.load_vgg(loaded.config.loss.vgg16, codes.device),
         rng=np.random.default_rng(loaded.config.train.seed),
     )
+
+
+def is_fit(loaded: Checkpoint) -> bool:
+    """Return whether a checkpoint is of a fit: it does not know whom else training saw."""
+    fitted = any(name.startswith(TRAINING) for name in loaded.gallery.cameras)
+    return fitted and "iteration" not in loaded.loop
 
 
 def use_optimizer(state: FitState, optimizer: torch.optim.Optimizer) -> torch.optim.Optimizer:
@@ -181,7 +188,7 @@ def save_fit(
     }
     # Training cameras stay for rendering; the subject's own come first.
     cameras: dict[str, PinholeView] = own.cameras | {
-        f"training_{name}": view for name, view in trained.cameras.items()
+        f"{TRAINING}{name}": view for name, view in trained.cameras.items()
     }
     save_checkpoint(
         path,

@@ -125,6 +125,7 @@ def fit(args: argparse.Namespace) -> int:
     """Fit an unseen person and report on the views that the fit did not use."""
     from grmm.checkpoint import read_content
     from grmm.fit import fit
+    from grmm.fit_state import is_fit
     from grmm.shard_source import ShardSource, select
 
     check_results_folder(args.out)
@@ -136,7 +137,12 @@ def fit(args: argparse.Namespace) -> int:
             if "shuffle" in read_content(made).get("loop", {}):
                 raise ConfigError(f"{made} is of a training, not of a fit; name another folder")
     loaded = _load(args.checkpoint, [*args.set, *_metric_settings(args)], args.seconds)
-    if not _warns_of_fit(args.checkpoint, loaded) and args.subject in loaded.model.subjects:
+    if is_fit(loaded):
+        log(
+            f"{args.checkpoint} is a fit of {loaded.model.subjects[0]}: it knows one person only; "
+            "fit people from a checkpoint of 'grmm train'"
+        )
+    elif args.subject in loaded.model.subjects:
         log(f"{args.subject} was trained on, so the figures are not those of an unseen person")
     views = loaded.views(ShardSource(args.shards, "*"))
     given = select(views.keys, args.subject, args.expression, args.cameras)
@@ -148,16 +154,6 @@ def fit(args: argparse.Namespace) -> int:
     psnr = f"{figure_label('psnr_db')}: {metrics['psnr_db']}"
     line = f"{psnr} ({metrics['psnr_is_of']}), after {reached}"
     return answer(args, metrics, line, f"wrote {args.out}")
-
-
-def _warns_of_fit(path: Path, loaded: Checkpoint) -> bool:
-    """Return whether a checkpoint is a fit, and if so, say that nobody should be fitted from it."""
-    if is_fit := "iteration" not in loaded.loop and len(loaded.model.subjects) == 1:
-        log(
-            f"{path} is a fit of {loaded.model.subjects[0]}: it knows one person only; "
-            "fit people from a checkpoint of 'grmm train'"
-        )
-    return is_fit
 
 
 def _check_evaluation_folder(out: Path) -> None:
@@ -282,6 +278,7 @@ def evaluate(args: argparse.Namespace) -> int:
     from express50.geometry.sampling import evenly
     from grmm.evaluate import SEEN, evaluate, journal_rows, kind_of, save_pictures, training_render
     from grmm.fit import FITS, evaluate_unseen, unseen_views
+    from grmm.fit_state import is_fit
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource
 
@@ -290,6 +287,11 @@ def evaluate(args: argparse.Namespace) -> int:
         check_results_folder(args.save)
     _require(args, "fit_cameras", "fit_budget")
     loaded = _load(args.checkpoint, _metric_settings(args), args.fit_budget)
+    if args.fit_cameras and is_fit(loaded):
+        raise ConfigError(
+            f"{args.checkpoint} is a fit of {loaded.model.subjects[0]}: it does not hold whom"
+            " training saw; --fit-cameras needs a checkpoint of 'grmm train'"
+        )
     source = ShardSource(args.shards, "*")
     views = loaded.views(source)
     judge = PerceptualMetrics(loaded.config.metrics)
@@ -304,8 +306,6 @@ def evaluate(args: argparse.Namespace) -> int:
             "--holdout-cameras"
         )
     protocol = _protocol(args)
-    if unseen:
-        _warns_of_fit(args.checkpoint, loaded)
     for subject, chosen in unseen.items():  # before anybody is fitted for nothing
         trained = loaded.model.expressions
         _, unseen[subject] = unseen_views(trained, views, subject, protocol, chosen)

@@ -173,7 +173,7 @@ def test_rows_of_other_samples_are_not_replaced(tmp_path, monkeypatch):
 def test_what_cannot_be_measured_is_refused_before_training(roots, tmp_path, monkeypatch, capsys):
     monkeypatch.delattr(ablate_module, "train")
     assert main([*command(roots, tmp_path), "--fit-subjects=S001,S002"]) == 2
-    assert "S001 are also trained on; expected people that" in capsys.readouterr().err
+    assert "training also sees S001; expected people that" in capsys.readouterr().err
     assert main([*command(roots, tmp_path), "--fit-cameras=cam*"]) == 2
     assert "S002: no view is left to measure" in capsys.readouterr().err
 
@@ -303,7 +303,7 @@ def test_seeds_give_intervals_and_test_shards_give_people_alone(tmp_path, capsys
     )
     assert row["groups"]["unseen"]["images"] == 2 and " ± " in said.out
     assert main([*arguments, f"--test={roots[0]}"]) == 2
-    assert "S000, S001 are also trained on" in capsys.readouterr().err
+    assert "training also sees S000, S001; expected" in capsys.readouterr().err
 
 
 def test_a_row_without_its_first_seed_is_left_out(table, roots, tmp_path, monkeypatch):

@@ -2,6 +2,7 @@ import csv
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +18,7 @@ from express50.files.atomic import alone_in
 from express50.files.images import read_image
 from express50.files.video import BT601, EXACT, LIMITED
 from express50.shards.writer import PackedSample, ShardWriter
-from grmm.checkpoint import load_checkpoint
+from grmm.checkpoint import load_checkpoint, redact
 from grmm.cli import build_parser, main
 from grmm.cli.commands import _edited_head, train_config
 from grmm.edit import trained_head
@@ -246,10 +247,18 @@ def test_people_who_are_known_or_left_out_are_named(checkpoint, shards, tmp_path
     assert main(evaluate) == 0
     said = capsys.readouterr().err
     assert "left out S000, S002" in said and "training did not see" not in said
-    assert main([*evaluate, "--fit-cameras=cam00", "--fit-expression=e0"]) == 0
-    said = capsys.readouterr().err
     assert "e: its evaluation will be replaced; to keep it, stop and name" in said
-    assert "is a fit of S001: it knows one person only" in said
+    before = (tmp_path / "e" / "evaluation.csv").read_bytes()
+    assert main([*evaluate, "--fit-cameras=cam00", "--fit-expression=e0"]) == 2
+    assert "checkpoint.pt is a fit of S001: it does not hold whom" in capsys.readouterr().err
+    assert (tmp_path / "e" / "evaluation.csv").read_bytes() == before
+
+
+def test_a_training_that_one_person_is_left_of_is_not_taken_for_a_fit(checkpoint, shards, tmp_path):
+    copied = shutil.copy(checkpoint, tmp_path / "checkpoint.pt")
+    assert redact(copied, "S000")
+    evaluate = ["evaluate", str(copied), str(shards), str(tmp_path / "e"), "--subjects=S002"]
+    assert main([*evaluate, "--fit-cameras=cam00", "--fit-expression=e0"]) == 0
 
 
 def test_a_summary_names_a_metric_that_is_missing_once():
@@ -299,8 +308,8 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
          "training saw every"),
         (["evaluate", "{checkpoint}", "{shards}", "{out}", "--subjects=S002", "--cameras=cam00",
           "--fit-cameras=cam00", "--fit-expression=e0"], 2, "no view is left to measure"),
-        (["ablate", "{shards}", "{out}", *TINY, "--fit-subjects=S9"], 2,
-         "the shards have S000, S001, S002"),
+        (["ablate", "{shards}", "{out}", *TINY, "--fit-subjects=S9,S001"], 2,
+         "--fit-subjects: no person 'S9'; expected one of S000, S001, S002"),
         (["config", "trian"], 2, "'trian'"),
         (["score", "{shards}", "{shards}", "{checkpoint}"], 2, "is a file, expected a folder"),
         (["render", "{out}/absent.pt", "{out}"], 1, "absent.pt: no such file"),

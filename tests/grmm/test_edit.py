@@ -107,11 +107,11 @@ def test_principal_directions_rebuild_the_covariance(loaded):
         ({"jawOpen": (1.0,)}, "did you mean 'jaw.0'"),
         ({"expression.jawOpen": (1.0,)}, "did you mean 'jaw.0'"),
         ({"jaw": (1.0,)}, "got 1 number, expected 3 with commas between, or jaw.0"),
-        ({"neck.3": (1.0,)}, "none of the 3 neck parameters; expected 0 to 2"),
+        ({"neck.3": (1.0,)}, r"none of the neck parameters \(3\); expected 0 to 2$"),
         ({"expression.nope": (1.0,)}, "0 to 3, or a name such as e0, e1, e2 and 1 more$"),
         ({"expression.E3x": (1.0,)}, "did you mean 'e3'"),
         ({"expression": (1.0,)}, "expected one entry"),
-        ({"z_id.2": (1.0,)}, "2 principal directions"),
+        ({"z_id.2": (1.0,)}, r"directions of 3 training codes \(2\); expected 0 to 1$"),
         ({"jaw.0": (float("nan"),)}, "jaw.0: got nan, expected -1000 to 1000"),
         ({"shape.0": (1e30,)}, r"shape.0: got 1e\+30, expected -1000 to 1000"),
     ],
@@ -123,11 +123,15 @@ def test_wrong_controls_are_named(loaded, controls, message):
         trained_head(loaded, "S9", "e0")
 
 
-def test_codes_of_one_person_have_no_direction_to_move_along(loaded):
-    lone = copy.deepcopy(loaded)
-    lone.model.z_id = torch.nn.Parameter(lone.model.z_id[:1].detach())
-    with pytest.raises(ConfigError, match="the 0 principal directions.*; one person .* has none"):
-        controlled(lone, trained_head(lone, "S000", "e0"), {"z_id.0": (1.0,)})
+@pytest.mark.parametrize(
+    ("people", "words"),
+    [(1, r"of 1 training code \(0\); one person .* has none$"), (2, r"\(1\); expected 0$")],
+)
+def test_few_codes_have_few_directions_to_move_along(loaded, people, words):
+    few = copy.deepcopy(loaded)
+    few.model.z_id = torch.nn.Parameter(few.model.z_id[:people].detach())
+    with pytest.raises(ConfigError, match=words):
+        controlled(few, trained_head(few, "S000", "e0"), {"z_id.999": (1.0,)})
 
 
 def test_samples_have_the_mean_and_covariance_of_training(loaded):
