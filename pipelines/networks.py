@@ -122,10 +122,11 @@ def _torchscript(path: Path, role: Role) -> Network:
     try:
         module = torch.jit.load(str(path), map_location=device).eval()
         arguments = module.forward.schema.arguments[1:]
-    except TORCH_ERRORS as error:
+    except TORCH_ERRORS:
+        # PyTorch's message speaks of its own internals, and guesses what happened to the file.
         raise StageError(
-            f"{role.setting} {path}: not TorchScript with a forward ({_reason(error)});"
-            " expected a file of torch.jit.save, or .onnx"
+            f"{role.setting} {path}: not TorchScript with a forward, or damaged; expected a file of"
+            " torch.jit.save (a state dict is not enough), or .onnx: export it, or download it again"
         ) from None
     needed = sum(not argument.has_default_value() for argument in arguments)
     _check_inputs(path, role, needed, len(arguments))
@@ -200,7 +201,8 @@ def _onnx(path: Path, role: Role) -> Network:
         session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     except errors as error:
         raise StageError(
-            f"{role.setting} {path}: onnxruntime cannot load it ({_reason(error)})"
+            f"{role.setting} {path}: onnxruntime cannot load it ({_reason(error)});"
+            " expected an ONNX network: export it, or download it again"
         ) from None
     slots = session.get_inputs()
     _check_inputs(path, role, len(slots), len(slots))

@@ -28,10 +28,9 @@ from express50.console import (
     stdout_to_stderr,
 )
 from express50.contract.config import PRESETS, made_with, resolve_config
-from express50.contract.layout import Dataset, check_folder
+from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import Stage, stages
 from express50.dial.figures import Footage, dial_dir, footage_of, read_measured
-from express50.errors import StageError
 from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger
 from express50.runner.publish import size_of
@@ -117,8 +116,6 @@ def run_plan(args: argparse.Namespace) -> int:
     with stdout_to_stderr():
         known = list(stages().values())
         datasets = [dataset, *map(Dataset, args.also)]
-        for one in datasets:
-            check_folder(one)
         measured = [pair for one in datasets for pair in measure_sizes(one, known)]
     footage = measured[0][0]
     target = target_of(args.target, sizes, footage)
@@ -193,12 +190,14 @@ def measure_sizes(
     """Return what stages cost at each measured size: first from the run, then from ``tune``.
 
     Raises:
-        StageError: nothing was measured.
+        ConfigError: the folder is not a dataset.
+        StageError: nothing is ingested.
     """
     figures = read_measured(dial_dir(dataset) / "measured.json")
     trials = figures.trials if figures else []
     if not trials or dataset.subjects():
-        found = [(footage_of(dataset), measure(dataset, known))]
+        costs = measure(dataset, known)
+        found = [(footage_of(dataset), costs)]
     else:
         seen = trials[0]
         # A run without a budget has standard settings, which do not reduce pictures.
@@ -216,9 +215,8 @@ def measure_sizes(
 
 
 def measure(dataset: Dataset, known: Sequence[Stage]) -> dict[str, Measured]:
-    """Return what each stage that ran cost, by receipts and files; StageError without a ledger."""
-    if not dataset.ledger.is_file():
-        raise StageError(f"{dataset.root}: not a dataset (no ledger.sqlite)")
+    """Return what each stage that ran cost, by receipts and files; ConfigError without a ledger."""
+    existing_dataset(dataset.root)
     found = {}
     with Ledger(dataset.ledger, read_only=True) as ledger:
         for stage in known:

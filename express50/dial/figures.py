@@ -11,7 +11,7 @@ from typing import Any
 from express50.capture.index import UNKNOWN_HASH, read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, stages
-from express50.errors import FormatError, StageError
+from express50.errors import FormatError, StageError, advised
 from express50.files.text import read_json_table, read_toml
 
 SHORT_SIDE = 0.75  # of a picture over its long side if its shape is not known
@@ -66,7 +66,10 @@ def footage_of(dataset: Dataset) -> Footage:
     """Average the size of a dataset's footage; StageError if nothing is ingested."""
     indices = [read_index(dataset, subject) for subject in dataset.subjects()]
     if not indices:
-        raise StageError(f"{dataset.root}: nothing is ingested, so nothing was measured")
+        ingest = advised("express50 ingest", dataset.root, "CAPTURE")
+        raise StageError(
+            f"{dataset.root}: nothing is ingested, so nothing was measured; run {ingest}"
+        )
     cameras = [camera for index in indices for camera in index.cameras.values()]
     sizes = [(camera.width, camera.height) for camera in cameras]
     frames = sum(camera.frames for camera in cameras)

@@ -186,3 +186,12 @@ def test_a_folder_that_is_not_there_is_named_as_such(tmp_path, capsys):
         assert main([command[0], str(tmp_path / "lost"), *command[1:]]) == 2
         assert "no such dataset" in capsys.readouterr().err
     assert not (tmp_path / "lost").exists()
+
+
+def test_a_folder_without_a_dataset_is_not_called_empty_of_footage(tmp_path, capsys):
+    assert main(["plan", str(tmp_path)]) == 2
+    assert "not a dataset (no ledger.sqlite); run 'express50 ingest" in capsys.readouterr().err
+    with Ledger(Dataset(tmp_path).ledger):
+        pass
+    assert main(["plan", str(tmp_path)]) == 1
+    assert "nothing is ingested, so nothing was measured; run 'exp" in capsys.readouterr().err
