@@ -135,9 +135,9 @@ class PageServer(ThreadingHTTPServer):
             self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log one line on what went wrong, unless the browser just closed the connection."""
+        """Log one line on what went wrong, unless the browser was too slow or has gone."""
         error = sys.exc_info()[1]
-        if not isinstance(error, OSError):
+        if not isinstance(error, ConnectionError | TimeoutError):
             log(f"a request failed: {type(error).__name__}: {error}")
 
 

@@ -447,9 +447,10 @@ def study_make(args: argparse.Namespace) -> int:
 
     check_results_folder(args.out)
     methods = list(zip(args.names, (args.ours, args.theirs), strict=True))
-    study = make_study(
-        args.out, args.reference, methods, args.examples, args.participants, args.seed or 0
-    )
+    with alone_in(args.out):
+        study = make_study(
+            args.out, args.reference, methods, args.examples, args.participants, args.seed or 0
+        )
     say(f"wrote {args.out / 'study.json'}: {len(study['examples'])} examples")
     return OK
 
@@ -458,7 +459,9 @@ def study_serve(args: argparse.Namespace) -> int:
     """Serve a study until Ctrl-C."""
     from grmm.study import make_server
 
-    with make_server(args.out, args.host, args.port) as server:
+    check_results_folder(args.out)
+    # Answers would count for another study that was made meanwhile.
+    with alone_in(args.out), make_server(args.out, args.host, args.port) as server:
         say(f"{server.address}  (Ctrl-C stops; answers are kept)")
         server.serve_forever()
     return OK

@@ -38,6 +38,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 FIELDS = ("participant", "example", "question", "answer")
 DRAWS = 2000
 LEVEL = 0.95
+DIGITS = 4  # of percentages; of two, 19.0476 % would be shown as 19.1 %
 ANSWER_LIMIT = 4096  # bytes of one POST
 PAGE = Path(__file__).with_name("page.html")
 COLUMNS = ("first++", "first+", "second++", "second+", "tie")
@@ -274,11 +275,11 @@ def _row(study: dict, answers: Sequence[dict]) -> dict:
     for name, places in SUMS.items():
         row[name] = row[f"{name}_interval"] = None
         if people:
-            row[name] = round(float(_percent_of(counts.sum(0)[None], places)[0]), 2)
+            row[name] = round(float(_percent_of(counts.sum(0)[None], places)[0]), DIGITS)
         if len(people) > 1:
             tail = 50 * (1 - LEVEL)
             ends = np.percentile(_percent_of(counts[draws].sum(1), places), [tail, 100 - tail])
-            row[f"{name}_interval"] = [round(float(end), 2) for end in ends]
+            row[f"{name}_interval"] = [round(float(end), DIGITS) for end in ends]
     return row
 
 

@@ -1,6 +1,7 @@
 import json
 import re
 import shutil
+import socket
 import subprocess
 import threading
 import urllib.error
@@ -102,11 +103,21 @@ def test_table_turns_sides_back_into_methods(study):
     assert rows["identity"]["first++"] == 100 and rows["identity"]["first_interval"] == [100, 100]
     expression = rows["expression"]
     shares = [expression[name] for name in ("first+", "second++", "tie")]
-    assert shares == pytest.approx([33.33] * 3)
-    assert rows["overall"]["first"] == pytest.approx(66.67)
+    assert shares == pytest.approx([33.3333] * 3)
+    assert rows["overall"]["first"] == pytest.approx(66.6667)
     assert summary["judgments"] == summary["judgments_expected"] == 48
     text = markdown(summary)
     assert "| Identity | 100.0% | 0.0% | 0.0% | 0.0% | 0.0% |" in text and "MD ++" in text
+
+
+def test_shares_are_rounded_once(study):
+    """4 of 21 were shown as 19.1 %: 19.05 rounded again."""
+    answers = [
+        {"participant": p, "example": e, "question": "identity", "answer": "=" if p < 2 else "A+"}
+        for p, e in [*product((0, 1), (0, 1)), *product((2, 3), range(6))]
+    ]
+    answers += [answers[-1] | {"question": "expression", "example": e} for e in range(5)]
+    assert len(answers) == 21 and "| 19.0% |" in markdown(summarise(study[1], answers))
 
 
 def test_intervals_widen_where_participants_disagree(study):
@@ -247,6 +258,46 @@ def test_commands_make_and_table(folders, tmp_path, capsys):
     )
     assert main([*make, "--names", "GRMM", "MD"]) == 2
     assert "already has answers" in capsys.readouterr().err
+
+
+def test_a_study_that_is_served_is_not_made_anew(study, folders, monkeypatch, capsys):
+    """Answers counted for the sides of the newer study."""
+    folder, _ = study
+    make = ["study", "make", str(folder), f"--reference={folders['reference']}", "--examples=6"]
+    make += [f"--ours={folders['ours']}", f"--theirs={folders['theirs']}", "--seed=1"]
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    serve = ["study", "serve", str(folder), f"--port={port}"]
+    before, codes = read_study(folder), []
+
+    def meanwhile(server):
+        codes.extend(map(main, (make, serve)))
+
+    monkeypatch.setattr("express50.local_server.PageServer.serve_forever", meanwhile)
+    assert main(serve) == 0
+    assert codes == [2, 2] and read_study(folder) == before
+    assert capsys.readouterr().err.count("another process writes into this folder") == 2
+    assert main(make) == 0 and read_study(folder) != before
+    assert main(["study", "serve", str(folder / "study.json")]) == 2
+    assert "is a file, expected a folder" in capsys.readouterr().err
+
+
+def test_an_answer_that_cannot_be_written_is_said_where_the_server_runs(study, capsys):
+    folder, _ = study
+    answer = {"participant": 1, "example": 2, "question": "identity", "answer": "A++"}
+    with make_server(folder, port=0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        (folder / "answers.jsonl").mkdir()
+        body, kind = json.dumps(answer).encode(), {"Content-Type": "application/json"}
+        request = urllib.request.Request(f"{server.address}answers", body, kind)
+        try:
+            with pytest.raises(OSError, match="closed connection"):
+                urllib.request.urlopen(request, timeout=5)
+        finally:
+            server.shutdown()
+            thread.join()
+    assert "a request failed: IsADirectoryError: " in capsys.readouterr().err
 
 
 def test_too_few_common_pictures_are_refused(folders, tmp_path):
