@@ -126,7 +126,7 @@ def _torchscript(path: Path, role: Role) -> Network:
         # PyTorch's message speaks of its own internals, and guesses what happened to the file.
         raise StageError(
             f"{role.setting} {path}: not TorchScript with a forward, or damaged; expected a file of"
-            " torch.jit.save (a state dict is not enough), or .onnx: export it, or download it again"
+            " torch.jit.save (not a state dict), or .onnx: export it, or download it again"
         ) from None
     needed = sum(not argument.has_default_value() for argument in arguments)
     _check_inputs(path, role, needed, len(arguments))
