@@ -393,7 +393,8 @@ class _StageAudit:
             made = self.made[name][item]
             changed = differing(made.inputs, now)
             if not changed:
-                to_make.setdefault(why_outdated(stage, config, made, now), []).append(item)
+                why = why_outdated(stage, item, config, made, now)
+                to_make.setdefault(why, []).append(item)
             elif self._waits(item):
                 self._note(stage, f"{item} cannot be checked until its inputs are made again")
             else:

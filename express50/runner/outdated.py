@@ -21,14 +21,19 @@ BAD_INPUT = (Express50Error, OSError, ValueError, KeyError, TypeError)
 NAMED = 3  # inputs or settings that are named
 
 
-def why_outdated(stage: Stage, config: Any, made: Made, inputs: Mapping[str, str]) -> str:
-    """Say which of version, settings and inputs changed since an output was made.
+def why_outdated(
+    stage: Stage, item: str, config: Any, made: Made, inputs: Mapping[str, str]
+) -> str:
+    """Say which of version, settings and inputs changed since an item's output was made.
 
     ``inputs`` are digests of the present inputs by name.
     """
     words = []
     if changed := differing(made.inputs, inputs):
-        words.append(f"inputs changed: {few(changed, NAMED)}")
+        # An input's name may hold the item's expression; without it, items share their reason.
+        own = item.split("/")
+        short = [" ".join(w for w in name.split(" ") if w not in own) for name in changed]
+        words.append(f"inputs changed: {few(short, NAMED)}")
     then, now = made.settings, config_texts(config)
     if then and (names := differing(then, now)):
         changes = [f"{n} was {then.get(n, 'unknown')}, is {now.get(n, 'gone')}" for n in names]
@@ -63,7 +68,7 @@ def outdated(
                         now = input_digests(stage, dataset, item, config, digest)
                         if fingerprint(stage, config, now) != receipt.fingerprint:
                             row = made[stage.name][item]
-                            yield stage.name, item, why_outdated(stage, config, row, now)
+                            yield stage.name, item, why_outdated(stage, item, config, row, now)
 
 
 def published_digest(

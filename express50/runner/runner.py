@@ -39,6 +39,7 @@ from express50.runner.publish import (
 from express50.runner.worker import Task, failed_receipt, failure_reason, fingerprint, input_digests
 
 REASONS = 3  # for making items again, said before they are made
+OTHER_REASONS = "other reasons"
 WARNINGS = 12  # lines; more of them would hide the account
 ALIKE_FAILURES = 3  # if this many first items fail for the same reason, a setting is wrong
 KEPT = "imported; the stage does not make it"
@@ -282,7 +283,7 @@ def _compare(task: Task, former: Receipt, made: Made | None, ledger: Ledger, wor
         work.again[task.item] = "output missing"
         return
     made = made or Made(task.inputs, {})
-    work.again[task.item] = why_outdated(task.stage, task.config, made, task.inputs)
+    work.again[task.item] = why_outdated(task.stage, task.item, task.config, made, task.inputs)
     if not there:
         return
     # A later stage must not read an output beside newer data of earlier stages. Files outside of
@@ -378,12 +379,16 @@ def _say_again(stage: Stage, dataset: Dataset, work: _Work) -> None:
         for task in work.tasks
         if task.former is not None and not is_kept(dataset, stage.name, task.item, task.fingerprint)
     ]
-    for why, count in Counter(work.again[task.item] for task in lost).most_common(REASONS):
-        spent = sum(work.former[t.item].seconds for t in lost if work.again[t.item] == why)
-        write(
-            f"{stage.name}: makes {count_of(count, 'finished item')} again, which took"
-            f" {format_seconds(spent)}: {why}"
-        )
+    reasons = Counter(work.again[task.item] for task in lost).most_common(REASONS)
+    spent: dict[str, list[float]] = {why: [] for why in [*dict(reasons), OTHER_REASONS]}
+    for task in lost:
+        why = work.again[task.item]
+        spent[why if why in spent else OTHER_REASONS].append(work.former[task.item].seconds)
+    for why, seconds in spent.items():
+        if seconds:
+            items = count_of(len(seconds), "finished item")
+            took = format_seconds(sum(seconds))
+            write(f"{stage.name}: makes {items} again, which took {took}: {why}")
 
 
 def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Receipt]) -> None:

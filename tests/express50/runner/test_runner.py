@@ -125,6 +125,28 @@ def test_finished_work_that_will_be_made_again_is_announced(tmp_path, capsys):
     assert "toy: set aside 1 item (b), which it no longer makes" in said()
 
 
+def test_items_that_changed_for_one_reason_share_a_line_and_all_are_counted(tmp_path, capsys):
+    expressions = ("frown", "smile", "jaw_open", "pucker", "wink")
+    dataset = make_dataset(tmp_path / "data", [f"S001/{name}" for name in expressions])
+
+    def said(text, name):
+        stage = dataclasses.replace(
+            toy.STAGE, inputs=lambda _, item, config: {name(item.split("/")[1]): text}
+        )
+        capsys.readouterr()
+        run_stage(stage, dataset, toy.ToyConfig(), pool=Pool(0))
+        return [line for line in capsys.readouterr().err.splitlines() if "finished" in line]
+
+    for text in "ab":  # the name of the input holds the item's expression
+        lines = said(text, lambda expression: f"frame {expression} cam00")
+    (line,) = lines
+    assert "makes 5 finished items again" in line and line.endswith(": inputs changed: frame cam00")
+    for text in "cd":
+        lines = said(text, lambda expression: f"length {len(expression)}")
+    assert [line.split("makes ")[1].split(" ")[0] for line in lines] == ["2", "1", "1", "1"]
+    assert lines[-1].endswith(": other reasons")
+
+
 def test_the_receipt_of_an_output_that_fills_the_disk_is_kept(tmp_path, monkeypatch):
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
     write, refused = Ledger.write, []
