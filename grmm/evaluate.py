@@ -22,6 +22,7 @@ from express50.console import count, figure_label, format_seconds, format_table,
 from express50.contract.segmentation_labels import label_mask
 from express50.errors import ConfigError, DivergedError, FormatError, few
 from express50.files.atomic import naming_full_disk, write_csv, write_json
+from express50.files.containers import to_srgb
 from express50.files.images import read_image, write_image
 from express50.files.text import is_number, no_folder
 from express50.shards.writer import sample_key
@@ -252,12 +253,17 @@ def score(
         path = paths[index]
         rows_seen, columns_seen, size = window(index)
         try:
-            pixels = _read_picture(path, size)[rows_seen, columns_seen]
+            pixels = to_srgb(read_image(path))
         except FormatError as error:
             wrong.append(str(error))
             continue
+        if pixels.shape[:2] != size:
+            got, expected = (f"{width} x {height}" for height, width in (pixels.shape[:2], size))
+            wrong.append(f"{path.name} is {got}, expected {expected}")
+            continue
         item = views.item(index)
-        image = torch.from_numpy(pixels.copy()).permute(2, 0, 1).to(item.target) / 255
+        seen = torch.from_numpy(pixels[rows_seen, columns_seen].copy())
+        image = seen.permute(2, 0, 1).to(item.target) / 255
         rows.append(compare(image, item, judge))
     if wrong:
         raise FormatError(f"{folder}: {len(wrong)} pictures do not fit: {few(wrong, NAMED)}")
@@ -269,19 +275,6 @@ def find_picture(folder: Path, key: SampleKey) -> Path | None:
     name = sample_key(**vars(key))
     files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
     return next(filter(Path.is_file, files), None)
-
-
-def _read_picture(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Read (H, W, 3) uint8; grey is repeated over the channels, a fourth one is left out."""
-    pixels = read_image(path)
-    if pixels.shape[:2] != size:
-        got, expected = (f"{width} x {height}" for height, width in (pixels.shape[:2], size))
-        raise FormatError(f"{path.name} is {got}, expected {expected}")
-    if pixels.dtype != np.uint8:
-        raise FormatError(f"{path.name} has {pixels.dtype} pixels, expected 8 bits per channel")
-    if pixels.ndim == 2 or pixels.shape[2] < 3:
-        pixels = np.repeat(pixels.reshape(*size, -1)[..., :1], 3, axis=2)
-    return pixels[..., :3]
 
 
 def save_pictures(

@@ -236,6 +236,18 @@ def test_saved_pictures_score_as_they_were_evaluated(evaluated, roots, tmp_path)
         assert theirs[name] == pytest.approx(ours[name], abs=tolerance)
 
 
+def test_pictures_of_16_bits_score_as_those_of_8(evaluated, roots, tmp_path):
+    (tmp_path / "deep").mkdir()
+    found = []
+    for path in (evaluated / "pictures").glob("S000_*"):
+        write_image(tmp_path / "deep" / path.name, read_image(path).astype(np.uint16) * 257)
+    for number, folder in enumerate((evaluated / "pictures", tmp_path / "deep")):
+        score = ["score", str(folder), str(roots[0]), str(tmp_path / str(number))]
+        assert main([*score, "--subjects=S000"]) == 0
+        found.append((tmp_path / str(number) / "evaluation.csv").read_bytes())
+    assert found[0] == found[1]
+
+
 def test_saved_pictures_do_not_replace_others(evaluated, table, roots, tmp_path, capsys):
     pictures = evaluated / "pictures"
     before = {path.name: path.stat().st_mtime_ns for path in pictures.iterdir()}
