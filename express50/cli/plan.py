@@ -163,7 +163,8 @@ def _table(rows: Sequence[Row], total: Mapping[str, Any], workers: int) -> Itera
 
 
 def _hours(value: float | None, low: float | None, high: float | None) -> str:
-    return f"{_figure(value or 0, 3)} ({_figure(low or 0, 2)} to {_figure(high or 0, 2)})"
+    # Of one precision, so that no value seems to lie outside its interval.
+    return "{} ({} to {})".format(*(_figure(hours or 0, 2) for hours in (value, low, high)))
 
 
 def _disk(figures: Mapping[str, Any]) -> str:
@@ -180,7 +181,7 @@ def _words(footage: Footage) -> str:
     return (
         f"{count(footage.subjects, 'subject')} x {count(footage.expressions, 'expression')} x "
         f"{count(footage.views, 'camera')} of {footage.pixels / 1e6:.3g} megapixels, "
-        f"{count(footage.frames, 'frame')} per camera"
+        f"{count(round(footage.frames), 'frame')} per camera"
     )
 
 

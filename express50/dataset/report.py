@@ -91,6 +91,7 @@ def _stage_view(dataset: Dataset, stage: str, receipts: list[Receipt]) -> dict:
         "name": stage,
         "purpose": stages()[stage].purpose,
         "item_count": len(metrics),
+        "imported": sum(r.imported and not r.reason for r in receipts),
         "failed": [(r.item, r.reason) for r in receipts if r.reason],
         "dropped": _reasons(metrics, "dropped"),
         "noted": _reasons(metrics, "warnings"),

@@ -103,7 +103,7 @@ STAGE = Stage(
     try_files=try_files,
     needs_gpu=needs_gpu,
     help="separate the head from the background in every camera, and let the cameras agree",
-    purpose="The opacity of the subject in every peak frame, keyed per camera. In the pictures,"
+    purpose="The opacity of the subject in every peak frame, found per camera. In the pictures,"
     " what the other cameras removed is red and what they filled is green.",
     growth=Growth(
         items=("subjects", "expressions"), time=("views", "picture"), disk=("views", "picture")

@@ -43,7 +43,8 @@ def draw_overlays(
 ) -> dict[str, np.ndarray]:
     """Write overlay_<expression>.jpg: frame above, mesh and landmarks below, in four views.
 
-    Yellow: detected; green: fitted. Vertices (E, V, 3) world, rotations (E, 3, 3) from head to it.
+    Landmarks are yellow as detected and green as fitted, the mesh's outline is red. Vertices
+    (E, V, 3) world, rotations (E, 3, 3) from head to it.
     Returns by expression the overlay (TILE, TILE, 3) uint8 in the view that the face looks at.
     """
     folder.mkdir(parents=True, exist_ok=True)

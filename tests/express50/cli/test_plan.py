@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from express50.__main__ import main
-from express50.cli.plan import TARGETS, Measured, estimate, measure, measure_sizes, target_of
+from express50.cli.plan import (
+    TARGETS,
+    Measured,
+    _hours,
+    estimate,
+    measure,
+    measure_sizes,
+    target_of,
+)
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
 from express50.dial.choice import MeasuredSize, forecast
@@ -124,6 +132,17 @@ def test_figures_are_those_of_the_receipts(tmp_path, capsys):
     assert "was not run" in said and "not measured: calibrate" in said
     assert "e+" not in said
     assert main(["plan", str(root), "--size", "big"]) == 2
+
+
+def test_frames_are_whole_and_no_value_seems_to_lie_outside_its_interval(tmp_path, capsys):
+    names = ("smile", "frown", "pucker", "jaw_open")
+    for subject, count in (("S001", 3), ("S002", 4)):
+        given = {"subject": subject, "expressions": names[:count], "frames": 8, "size": 64}
+        make_capture(tmp_path / subject, cameras=1, **given)
+        ingest_captures(tmp_path / "data", tmp_path / subject)
+    assert main(["plan", str(tmp_path / "data"), "--target", "express-50"]) == 0
+    assert "8.29 megapixels, 137 frames per camera\n" in capsys.readouterr().out
+    assert _hours(36.62, 36.6, 64.1) == "37 (37 to 64)" and _hours(274, 86, 670.4)[:8] == "274 (86 "
 
 
 def test_reduced_pictures_keep_the_shape_of_the_footage():

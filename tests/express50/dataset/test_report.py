@@ -11,7 +11,7 @@ from express50.__main__ import main
 from express50.contract.layout import Dataset
 from express50.dataset.report import number, render_page
 from express50.files.images import decode_image, write_image
-from express50.runner.ledger import Ledger, Receipt
+from express50.runner.ledger import IMPORTED, Ledger, Receipt
 
 
 @pytest.fixture
@@ -49,6 +49,15 @@ def test_the_page_needs_no_other_file(dataset):
     assert sources
     assert all(s.startswith(("data:", "#")) for s in sources)
     assert page.count("data:image/jpeg;base64,") == 4
+
+
+def test_imported_items_are_named_as_such(dataset):
+    assert "another tool" not in render_page(dataset)
+    with Ledger(dataset.ledger) as ledger:
+        for camera in ("cam0", "cam1"):
+            made = {"stage": "matte", "item": f"S1/{camera}", "status": "done", "reason": ""}
+            ledger.write(Receipt(fingerprint=f"{IMPORTED}x", **made))
+    assert "Imported: 2 of these items were made by another tool." in render_page(dataset)
 
 
 def test_figures_have_readable_names_and_units(dataset):
