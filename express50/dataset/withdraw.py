@@ -32,6 +32,7 @@ from typing import IO, Any
 
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset, existing_dataset
+from express50.contract.stage import stages
 from express50.errors import Express50Error, FormatError, check_known
 from express50.files.atomic import alone_in, write_json
 from express50.files.digests import files_of, text_digest
@@ -155,14 +156,17 @@ def withdraw(
 
     Raises:
         UnknownNameError: the dataset has no such subject.
-        StageError: a stage is running.
+        StageError: a stage, or a run within a budget, is going on.
         NotReadyError: a model of the dataset, or one of ``checkpoints``, is being trained.
         FormatError: the ledger is damaged; nothing was removed.
     """
     finder = dataset_id_finder(dataset, subject)
-    names, models = (dataset.root / "config").glob("*.toml"), dataset.root / "grmm"
+    # A budgeted run holds "run" while its trials, datasets of their own, work on somebody. A stage
+    # that never ran would begin with the person whose data are being removed.
+    ran = {path.stem for path in (dataset.root / "config").glob("*.toml")}
+    names, models = sorted({"run", *stages(), *ran}), dataset.root / "grmm"
     places = [path for path in (models, *models.rglob("*"), *checkpoints) if path.exists()]
-    with hold_stages(dataset, sorted(path.stem for path in names)), ExitStack() as stack:
+    with hold_stages(dataset, names), ExitStack() as stack:
         for folder in {path if path.is_dir() else path.parent for path in places}:
             stack.enter_context(alone_in(folder))  # a training would save the person again
         paths = plan(dataset, subject)
