@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from scipy.ndimage import distance_transform_edt
 
 from express50.errors import ConfigError
 from express50.files.atomic import write_bytes
@@ -119,7 +120,7 @@ def decoded(
 
     Beside the Gaussians come the vertices (V, 3), metres, of the deformed mesh v_rec + v_id +
     M_face v_exp, and its texture (n_g, n_g, 3) uint8 sRGB. The texture holds the Gaussians'
-    colours, and the mean colour where no face covers a texel.
+    colours; texels that no face covers have the nearest one's, because viewers blend across seams.
     """
     model, state = loaded.model, head.state(loaded)
     gaussians = model.geometry(head.z_id, head.z_exp, state)
@@ -132,10 +133,13 @@ def decoded(
         colors=colours.cpu().numpy(),
     )
     side = loaded.config.model.n_g
-    texture = colours.mean(0).expand(side * side, 3).clone()
-    texture[model.texels] = colours
-    texture = (255 * texture.clamp(0, 1)).round().byte().view(side, side, 3)
-    return cloud, (state.vertices + gaussians.displacement).cpu().numpy(), texture.cpu().numpy()
+    row, column = np.divmod(model.texels.cpu().numpy(), side)
+    texture, bare = np.zeros((side, side, 3), np.uint8), np.ones((side, side), bool)
+    texture[row, column] = (255 * colours.clamp(0, 1)).round().byte().cpu().numpy()
+    bare[row, column] = False
+    nearest = distance_transform_edt(bare, return_distances=False, return_indices=True)
+    vertices = (state.vertices + gaussians.displacement).cpu().numpy()
+    return cloud, vertices, texture[tuple(nearest)]
 
 
 def arrays_npz(

@@ -242,6 +242,23 @@ def test_glb_holds_the_mesh_with_its_texture(loaded, tmp_path):
     np.testing.assert_array_equal(texture, colours)
 
 
+def test_texels_without_a_face_have_the_nearest_ones_colour(tmp_path):
+    """Their mean colour showed as a line along the seam of dark hair."""
+    config = tiny_config(model={"mouth": False}, train={"iterations": 1})
+    train(EllipsoidSource(size=32), ellipsoid_head(), tmp_path, config)
+    loaded = load_checkpoint(tmp_path / "checkpoint.pt")
+    _, _, texture = decoded(loaded, trained_head(loaded, "S001", "e1"), frontal(loaded))
+    side = config.model.n_g
+    covered = np.stack(np.divmod(loaded.model.texels.numpy(), side), 1)
+    shown = {tuple(place) for place in covered.tolist()}
+    bare = [place for place in np.ndindex(side, side) if place not in shown]
+    assert 50 < len(bare) < side**2 / 2
+    for place in bare:
+        away = np.square(covered - place).sum(1)
+        near = covered[away == away.min()]
+        assert (texture[near[:, 0], near[:, 1]] == texture[place]).all(1).any()
+
+
 def test_npz_holds_gaussians_mesh_and_codes(loaded, tmp_path):
     head, view = trained_head(loaded, "S001", "e1"), frontal(loaded)
     gaussians, _, _ = decoded(loaded, head, view)
