@@ -14,7 +14,16 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from socket import SHUT_RDWR, SO_REUSEADDR, SOCK_STREAM, SOL_SOCKET, getaddrinfo, socket
+from socket import (
+    AF_INET,
+    AF_INET6,
+    SHUT_RDWR,
+    SO_REUSEADDR,
+    SOCK_STREAM,
+    SOL_SOCKET,
+    getaddrinfo,
+    socket,
+)
 from threading import BoundedSemaphore, Timer
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -51,7 +60,8 @@ class RequestGuard:
 
     def address(self, port: int) -> str:
         """Return the address to open in a browser."""
-        return f"http://{self.host}:{port}/{self.token}/"
+        host = f"[{self.host}]" if ":" in self.host else self.host  # IPv6
+        return f"http://{host}:{port}/{self.token}/"
 
     def refusal(self, host: str | None, origin: str | None) -> str | None:
         """Return why a request with these headers is refused, or None."""
@@ -99,6 +109,7 @@ class PageServer(ThreadingHTTPServer):
         check_address(host, port)
         self.guard, self.get, self.post = RequestGuard(host), get, post
         self._free = BoundedSemaphore(AT_ONCE)
+        self.address_family = AF_INET6 if ":" in host else AF_INET
         super().__init__((host, port), _Handler)
 
     def serve_forever(self, poll_interval: float = 0.5) -> None:

@@ -4,6 +4,7 @@ import http.client
 import socket
 import threading
 import time
+import urllib.request
 from contextlib import contextmanager
 from http import HTTPStatus
 
@@ -24,8 +25,8 @@ def take(path, kind, body):
 
 
 @contextmanager
-def served(get=page):
-    with PageServer(get, take, "127.0.0.1", 0) as server:
+def served(get=page, host="127.0.0.1"):
+    with PageServer(get, take, host, 0) as server:
         thread = threading.Thread(target=server.serve_forever, args=[0.02])
         thread.start()
         try:
@@ -53,6 +54,16 @@ def test_only_the_address_that_was_printed_gives_the_page():
         again = PageServer(page, None, "127.0.0.1", 0)
         again.server_close()
         assert again.guard.token != token
+
+
+def test_an_address_of_ipv6_can_be_opened():
+    assert RequestGuard("::1").address(80).startswith("http://[::1]:80/")
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("this machine has no IPv6")
+    with served(host="::1") as server, urllib.request.urlopen(server.address, timeout=5) as reply:
+        assert reply.read() == b"a face"
 
 
 @pytest.mark.parametrize(
