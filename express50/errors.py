@@ -116,6 +116,11 @@ def few(names: Sequence[str], count: int = 3, between: str = ", ") -> str:
     return between.join(names[:count]) + more
 
 
+def rounded(value: float, digits: int = 2) -> str:
+    """Round to significant digits, without the exponent that ``g`` gives large numbers."""
+    return f"{value:.0f}" if value >= 10**digits - 0.5 else f"{value:.{digits}g}"
+
+
 def advised(*words: str | Path) -> str:
     """Return a command in quotation marks, as messages advise it; its paths suit any shell.
 

@@ -31,6 +31,7 @@ from express50.contract.config import PRESETS, made_with, resolve_config
 from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import Stage, stages
 from express50.dial.figures import Footage, dial_dir, footage_of, read_measured
+from express50.errors import rounded
 from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger
 from express50.runner.publish import size_of
@@ -164,17 +165,12 @@ def _table(rows: Sequence[Row], total: Mapping[str, Any], workers: int) -> Itera
 
 def _hours(value: float | None, low: float | None, high: float | None) -> str:
     # Of one precision, so that no value seems to lie outside its interval.
-    return "{} ({} to {})".format(*(_figure(hours or 0, 2) for hours in (value, low, high)))
+    return "{} ({} to {})".format(*(rounded(hours or 0) for hours in (value, low, high)))
 
 
 def _disk(figures: Mapping[str, Any]) -> str:
     value, low, high = (decimal(int(figures[f"disk{end}"] or 0)) for end in ("", "_low", "_high"))
     return f"{value} ({low} to {high})"
-
-
-def _figure(value: float, digits: int) -> str:
-    """Round to significant digits, without the exponent that ``g`` gives large numbers."""
-    return f"{value:.0f}" if value >= 10**digits - 0.5 else f"{value:.{digits}g}"
 
 
 def _words(footage: Footage) -> str:
@@ -304,7 +300,7 @@ def estimate(
                 disk_high=items * disk.high,
                 memory=max(c.memory for _, c in alike),
                 preset=cost.preset,
-                how=f"{' x '.join(growth.time) or 'constant'} = {_figure(ratio, 4)}",
+                how=f"{' x '.join(growth.time) or 'constant'} = {rounded(ratio, 4)}",
             )
         )
     return rows

@@ -24,7 +24,7 @@ from statistics import median
 from typing import Any, Literal, get_args
 
 from express50.contract.layout import Dataset
-from express50.errors import ConfigError, StageError
+from express50.errors import ConfigError, StageError, rounded
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class ExpectedError:
     def __str__(self) -> str:
         """Format for people: ``0.31 mm (0.22 to 0.5)``."""
         unit = "alpha at the outline" if self.unit == "alpha" else self.unit
-        return f"{self.value:.2g} {unit} ({self.low:.2g} to {self.high:.2g})"
+        return f"{rounded(self.value)} {unit} ({rounded(self.low)} to {rounded(self.high)})"
 
 
 def typical_error(metrics: Iterable[Mapping[str, Any]]) -> ExpectedError | None:

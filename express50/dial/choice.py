@@ -25,7 +25,7 @@ from express50.dial.budget import Goal
 from express50.dial.figures import Cost, Footage, PilotFigures, Trial
 from express50.dial.pilot import Ladder, standard_of
 from express50.dial.results import RESULTS, ResultKind
-from express50.errors import ConfigError
+from express50.errors import ConfigError, rounded
 
 DRAWS = 400
 LEAST_SPREAD = 0.05  # of a mean: machines vary as much from day to day
@@ -428,8 +428,8 @@ def choose(points: Sequence[Point], seconds: float, goal: tuple[str, float] | No
 
 def error_text(name: str, error: Expected) -> str:
     """Write an expected error for people."""
-    text = f"{name} {error.value:.2g} {error.unit}"
-    return f"{text} ({error.low:.2g} to {error.high:.2g})" if error.stated else text
+    text = f"{name} {rounded(error.value)} {error.unit}"
+    return f"{text} ({rounded(error.low)} to {rounded(error.high)})" if error.stated else text
 
 
 def choice_lines(load: Workload, point: Point, asked: str, spent: float) -> Iterator[str]:

@@ -43,7 +43,7 @@ from express50.dial.measuring import (
 )
 from express50.dial.pilot import Chain, keep_for_run, stated_errors
 from express50.dial.results import RESULTS
-from express50.errors import ConfigError, FormatError
+from express50.errors import ConfigError, FormatError, rounded
 from express50.files.atomic import write_json
 from express50.files.text import read_json_table
 from express50.runner.runner import Outcome, Summary, run_stage
@@ -320,10 +320,15 @@ def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str
     units = {kind.name: kind.unit for kind in RESULTS}
     units |= {name: said["unit"] for name, said in promised.items()}
     for name, (value, low, high) in state.stated.items():
-        said = f"{promised[name]['value']:.2g} promised" if name in promised else "nothing promised"
-        yield f"{name}: {value:.2g} {units[name]} ({low:.2g} to {high:.2g}), {said}"
+        said = (
+            f"{rounded(promised[name]['value'])} promised"
+            if name in promised
+            else "nothing promised"
+        )
+        yield f"{name}: {rounded(value)} {units[name]} ({rounded(low)} to {rounded(high)}), {said}"
     for name in (n for n in promised if n not in state.stated and state.finished):
-        yield f"{name}: no error is stated, {promised[name]['value']:.2g} {units[name]} promised"
+        expected = f"{rounded(promised[name]['value'])} {units[name]}"
+        yield f"{name}: no error is stated, {expected} promised"
     left = [f"{s.count('left')} of {s.stage}" for s in summaries if s.count("left")]
     if left:
         cores = bool(state.budget) and parse_budget(state.budget).cores

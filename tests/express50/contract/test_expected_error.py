@@ -5,6 +5,7 @@ import math
 import pytest
 
 from express50.contract.stage import ExpectedError, Result, typical_error
+from express50.dial.choice import Expected, error_text
 from express50.errors import StageError
 
 
@@ -35,3 +36,10 @@ def test_items_without_a_figure_and_damaged_ones_do_not_count():
     assert typical_error([*rows, Result().to_json(), *damaged]) == ExpectedError(2, 1, 4, "mm")
     assert typical_error([]) is None
     assert str(ExpectedError(0.312, 0.22, 0.5, "mm")) == "0.31 mm (0.22 to 0.5)"
+
+
+def test_large_errors_are_written_without_exponents():
+    """One camera leaves the scale open: the interval of a photograph reaches beyond 100 mm."""
+    assert str(ExpectedError(36.2, 9.44, 104.3, "mm")) == "36 mm (9.4 to 104)"
+    expected = Expected(value=118.2, low=99.6, high=1234.0, unit="mm", stated=True)
+    assert error_text("mesh", expected) == "mesh 118 mm (100 to 1234)"
