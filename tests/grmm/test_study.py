@@ -236,6 +236,42 @@ def test_a_participant_sees_the_pictures(study, tmp_path, monkeypatch):
     assert widths and all(int(width) > 0 for width in widths.groups()), found.stdout[:500]
 
 
+TWICE = """
+const elements = {}, posts = [], script = SCRIPT, study = STUDY;
+const make = () => ({hidden: false, value: "", elements: {}, append() {}, replaceChildren() {}});
+globalThis.document = {getElementById: id => elements[id] ??= make(), createElement: make};
+globalThis.fetch = async (url, options) => {
+  if (options) posts.push(JSON.parse(options.body));
+  await new Promise(done => setTimeout(done, 5));
+  return {ok: true, json: async () => options ? {} : study};
+};
+(0, eval)(script);
+const event = {preventDefault() {}};
+document.getElementById("participant").value = "1";
+elements.start.onsubmit(event).then(async () => {
+  elements.trial.elements = {expression: {value: "A+"}, identity: {value: "="}};
+  await Promise.all([elements.trial.onsubmit(event), elements.trial.onsubmit(event)]);
+  const once = elements.title.textContent;
+  await elements.trial.onsubmit(event);
+  console.log(JSON.stringify({once, then: elements.title.textContent, posts}));
+});
+"""
+
+
+def test_a_double_click_does_not_skip_an_example(study):
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+    made = study[1]
+    script = PAGE.read_text().split("<script>")[1].split("</script>")[0]
+    shown = {"trials": trials(made, 1)[:3], "questions": made["questions"], "done": []}
+    code = TWICE.replace("SCRIPT", json.dumps(script)).replace("STUDY", json.dumps(shown))
+    run = subprocess.run(["node", "-e", code], capture_output=True, text=True, check=True)
+    found = json.loads(run.stdout)
+    assert (found["once"], found["then"]) == ("2 to go", "1 to go")
+    wanted = [trial["example"] for trial in shown["trials"][:2] for _ in made["questions"]]
+    assert [answer["example"] for answer in found["posts"]] == wanted
+
+
 @pytest.mark.parametrize(
     "change", [{"methods": ["Ours"]}, {"seed": "0"}, {"examples": [{}]}, {"examples": [1]}]
 )
