@@ -111,10 +111,12 @@ def coverage(dataset: Dataset) -> dict[str, dict]:
 
 def progress(dataset: Dataset, subject: str) -> dict[str, object]:
     """Count a subject's expressions by who labelled them."""
-    count = Counter(map(origin, current_labels(read_labels(dataset, subject)).values()))
+    force = current_labels(read_labels(dataset, subject))
+    names = [cue.expression_id for cue in read_index(dataset, subject).cues]
+    count = Counter(origin(force[name]) for name in names if name in force)
     return {
         "subject": subject,
-        "expressions": len(read_index(dataset, subject).cues),
+        "expressions": len(names),
         "by_person": count["person"],
         "by_rule": count["rule"],
         "automatic": count["auto"],

@@ -85,6 +85,17 @@ def test_status_counts_people_rules_and_flags(annotate):
     assert annotate("status")["annotators"]["ann"]["labels"] == 1
 
 
+def test_labels_of_an_expression_that_is_gone_do_not_count(annotate, dataset):
+    mark(annotate, "ann", "smile", 14)
+    mark(annotate, "ann", "neutral", 2)
+    index = json.loads(dataset.index_file("S001").read_text())
+    cues = [cue for cue in index["cues"] if "smile" not in str(cue)]  # renamed in cues.csv
+    assert len(cues) == len(index["cues"]) - 1
+    dataset.index_file("S001").write_text(json.dumps(index | {"cues": cues}))
+    row = annotate("status")["subjects"][0]
+    assert (row["by_person"], row["expressions"]) == (1, len(EXPRESSIONS) - 1)
+
+
 def test_agree_measures_and_review_settles_without_losing_labels(annotate):
     for who, smile, wink in (("ann", 12, 24), ("bob", 18, 25)):
         mark(annotate, who, "smile", smile)
