@@ -10,7 +10,7 @@ from typing import Any
 from express50.contract.config import config_texts, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.errors import ConfigError, Express50Error, few
+from express50.errors import Express50Error, few
 from express50.files.digests import path_digest, text_digest
 from express50.runner.ledger import Ledger, Made
 from express50.runner.worker import fingerprint, input_digests
@@ -54,16 +54,18 @@ def outdated(
     """Yield stage, item and reason of each output that the next run would make again.
 
     The settings are those of each stage's last run. Outputs whose inputs cannot be read are left
-    out: `express50 check` finds these. For published files the ledger's digests are used.
+    out: `express50 check` finds these; so are those of items that no longer exist, which the next
+    run sets aside. For published files the ledger's digests are used.
     """
     made = {stage.name: ledger.made(stage.name) for stage in stages}
     digest = published_digest(dataset, made, ledger.sha256)
     for stage in stages:
-        with suppress(ConfigError):  # a setting no longer exists; the next run says so
+        with suppress(*BAD_INPUT):  # such as a setting that no longer exists; the next run says so
             path = dataset.config_file(stage.name)
             config = resolve_config(stage, "standard", path, (), [s.name for s in stages])
+            present = made[stage.name].keys() & set(stage.items(dataset))
             for item, receipt in ledger.read(stage.name).items():
-                if item in made[stage.name] and not receipt.imported:
+                if item in present and not receipt.imported:
                     with suppress(*BAD_INPUT):
                         now = input_digests(stage, dataset, item, config, digest)
                         if fingerprint(stage, config, now) != receipt.fingerprint:

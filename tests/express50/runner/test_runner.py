@@ -26,6 +26,7 @@ from express50.runner import publish
 from express50.runner.clusters import RemoteWorkers
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
+from express50.runner.outdated import outdated
 from express50.runner.runner import Outcome, Summary, run_stage, select_items
 from express50.runner.worker import Task, keep_freed_memory, peak_memory, reset_peak_memory
 from tests.faults import toy
@@ -145,6 +146,17 @@ def test_items_that_changed_for_one_reason_share_a_line_and_all_are_counted(tmp_
         lines = said(text, lambda expression: f"length {len(expression)}")
     assert [line.split("makes ")[1].split(" ")[0] for line in lines] == ["2", "1", "1", "1"]
     assert lines[-1].endswith(": other reasons")
+
+
+def test_outputs_of_items_that_are_gone_are_not_called_outdated(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    run_toy(dataset)
+    fewer = dataclasses.replace(toy.STAGE, items=lambda dataset: ["a"])
+    for name in "ab":
+        (dataset.root / "in" / f"{name}.txt").write_text("other")
+    with Ledger(dataset.ledger) as ledger:
+        for stage, items in ((toy.STAGE, ["a", "b"]), (fewer, ["a"])):
+            assert [item for _, item, _ in outdated(dataset, [stage], ledger)] == items
 
 
 def test_the_receipt_of_an_output_that_fills_the_disk_is_kept(tmp_path, monkeypatch):
