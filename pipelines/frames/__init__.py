@@ -75,7 +75,7 @@ def run(dataset: Dataset, item: str, config: FramesConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="frames",
-    version=12,
+    version=13,
     config=FramesConfig,
     items=items,
     inputs=inputs,

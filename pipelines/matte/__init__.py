@@ -95,7 +95,7 @@ def needs_gpu(config: MatteConfig) -> bool:
 
 STAGE = Stage(
     name="matte",
-    version=39,
+    version=40,
     config=MatteConfig,
     items=peak_items,
     inputs=inputs,

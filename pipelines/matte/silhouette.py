@@ -27,7 +27,7 @@ WEIGHTS = Path(__file__).with_name("silhouette_weights.npz")
 CROP = 128  # side of the network's picture, pixels
 SPAN_M = 0.64  # and in metres of the head
 UP_M, LEAST_UP = 0.1, 0.4  # a step upwards on the head, and the least share of it that shows up
-WIDTHS = (16, 24, 40, 64, 96)
+WIDTHS = (24, 36, 56, 80, 112)
 CONTRAST = 0.03  # of pictures in [0, 1], that counts as flat
 
 

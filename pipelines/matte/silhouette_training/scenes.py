@@ -291,7 +291,8 @@ def some_colour(rng: Rng, own: list[np.ndarray] | None = None) -> np.ndarray:
     """Draw a colour (3,) as in pictures: often grey, and often one of the person's `own`."""
     kind = rng.random()
     if kind < 0.3 and own:
-        mine = own[rng.integers(len(own))] * rng.uniform(0.6, 1.4) * rng.uniform(0.9, 1.1, 3)
+        tone = 1 + 0.4 * rng.uniform(-1, 1) ** 3  # often nearly the same
+        mine = own[rng.integers(len(own))] * tone * rng.uniform(0.93, 1.07, 3)
         return np.clip(mine, 0, 1)
     if kind < 0.65:
         return np.clip(rng.uniform(0.05, 0.95) + rng.normal(size=3) * 0.06, 0, 1)
