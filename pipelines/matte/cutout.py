@@ -49,6 +49,7 @@ UNSEEN = 2 / COLOURS**3  # the person does not have colours of a smaller share
 CLEARLY = 4.0  # ratio of shares from which a colour is the person's, not the wall's
 # Chances of the network below which colours count less, count on bodies alone, and do not count.
 UNLIKELY, SELDOM, HARDLY = 0.1, 0.05, 0.01
+SHIRT, PLAIN = 0.98, 4.0  # chance of a shirt of the wall's colour; its most spread, 8-bit Lab
 CELLS = 96  # cells along each side of the cube in which cameras are compared
 
 
@@ -126,7 +127,7 @@ def cut_out(
     """
     place = place or find_head(views)
     bodies = [_body(view, place) for view in views]
-    guesses = guess_person(views, place, bodies)
+    guesses, shirts = guess_person(views, place, bodies)
     for view, guess in zip(views, guesses, strict=True):
         if view.known is None:
             # Heads and necks of others are wall but where the person surely is, in front of
@@ -150,9 +151,14 @@ def cut_out(
     if len(views) < MANY:
         starts = [_with_own_colours(*pair) for pair in zip(views, guesses, strict=True)]
     masks = cut(starts)
+    shirts = shirts_like_the_wall(views, shirts, guesses, masks)
+    if any(map(np.any, shirts)):
+        for start, guess, shirt in zip(starts, guesses, shirts, strict=True):
+            start[shirt] = guess[shirt] = cv2.GC_FGD
+        masks = cut(starts)
     if ball is not None and len(views) >= FEWEST:
         for slack in SLACK_PX:
-            masks = cut(_corrected_labels(views, guesses, masks, ball, slack))
+            masks = cut(_corrected_labels(views, guesses, shirts, masks, ball, slack))
     cuts = map(Cut, masks, density, bodies)
     return {view.name: found for view, found in zip(views, cuts, strict=True)}
 
@@ -210,21 +216,23 @@ def find_neighbours(view: CutView, place: HeadPlace) -> list[HeadPlace]:
 
 def guess_person(
     views: Sequence[CutView], place: HeadPlace, bodies: Sequence[np.ndarray]
-) -> list[np.ndarray]:
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Guess where the person is: GrabCut labels (h, w) uint8 of each view to start from.
 
-    `bodies` (h, w) bool are where the body below the neck may be.
+    `bodies` (h, w) bool are where the body below the neck may be. Also returns where the network is
+    sure of it, (h, w) bool.
     """
     from pipelines.matte.silhouette import chances, crop_about, enlarged, network_input
 
     guesses = [average_person(view, place) for view in views]
+    shirts = [np.zeros_like(body) for body in bodies]
     shown: list[tuple[int, np.ndarray]] = []
     for k, view in enumerate(views):
         pixels = place.pixels(chin_and_above(), view.camera)
         if view.known is None and len(pixels) == 2:
             shown.append((k, crop_about(pixels[0], pixels[1], place.density(view.camera))))
     if not shown:
-        return guesses
+        return guesses, shirts
     seen = [network_input(views[k].rgb, views[k].valid, guesses[k], m) for k, m in shown]
     for (k, matrix), chance in zip(shown, chances(seen), strict=True):
         average, body = guesses[k], bodies[k]
@@ -233,17 +241,19 @@ def guess_person(
         least = np.where(average == cv2.GC_PR_FGD, UNLIKELY, 0.5)
         guess = np.where(share > least, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
         guess[(average == cv2.GC_BGD) & (share <= 0.5)] = cv2.GC_BGD
-        # Shirts may have the wall's colour, so that the network misses them: there it decides only
-        # if it is surer, and with many views not at all.
+        # Shirts may have the wall's colour, so that the network misses them: there it rules pixels
+        # out only if it is surer, and with many views none. What it adds is judged later.
         guess[(share < SELDOM) & ~body] = cv2.GC_BGD
         if len(views) < MANY:
-            guess[share < HARDLY], guess[share > 1 - HARDLY] = cv2.GC_BGD, cv2.GC_FGD
+            guess[share < HARDLY] = cv2.GC_BGD
+            guess[(share > 1 - HARDLY) & ~body] = cv2.GC_FGD
         else:
             guess[(share > 1 - SELDOM) & ~body] = cv2.GC_FGD
             guess[body & (average == cv2.GC_PR_FGD)] = cv2.GC_PR_FGD
         guess[average == cv2.GC_FGD] = cv2.GC_FGD
         guesses[k] = np.where(share < 0, average, guess)
-    return guesses
+        shirts[k] = body & (share > SHIRT) & views[k].valid
+    return guesses, shirts
 
 
 def _body(view: CutView, place: HeadPlace) -> np.ndarray:
@@ -384,9 +394,30 @@ def _with_own_colours(view: CutView, guess: np.ndarray) -> np.ndarray:
     return np.where(like, np.uint8(cv2.GC_PR_FGD), guess)
 
 
+def shirts_like_the_wall(
+    views: Sequence[CutView], shirts: Sequence[np.ndarray], guesses: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray],
+) -> list[np.ndarray]:  # fmt: skip
+    """Return `shirts` (h, w) if what `masks` (h, w) lack of them has one colour in each view.
+
+    Then they have the wall's colour. Else the wall shows through: scans of heads end at the
+    shoulders, which the network does not know. What the `guesses` call wall does not count.
+    """
+    shirts = [one & (guess != cv2.GC_BGD) for one, guess in zip(shirts, guesses, strict=True)]
+    lost = [shirt & ~mask for shirt, mask in zip(shirts, masks, strict=True)]
+    far = 0.0
+    for view, part in zip(views, lost, strict=True):
+        if part.any():
+            lab = cv2.cvtColor(cv2.GaussianBlur(view.rgb, (0, 0), 1), cv2.COLOR_RGB2LAB)[part]
+            far += float(np.abs(lab - np.median(lab, axis=0)).mean(1).sum())
+    plain = far < PLAIN * sum(map(np.count_nonzero, lost))
+    return shirts if plain else [np.zeros_like(one) for one in shirts]
+
+
 def _corrected_labels(
     views: Sequence[CutView],
     guesses: Sequence[np.ndarray],
+    shirts: Sequence[np.ndarray],
     masks: Sequence[np.ndarray],
     ball: Ball,
     slack: float,
@@ -404,18 +435,20 @@ def _corrected_labels(
     seen = [evidence_of(matte, space, place) for matte in mattes]
     sure = [one.solid | (guess == cv2.GC_FGD) for one, guess in zip(seen, guesses, strict=True)]
     foreign = _foreign(mattes, sure)
-    rows = zip(mattes, seen, guesses, foreign, strict=True)
+    rows = zip(mattes, seen, guesses, shirts, foreign, strict=True)
     return [_labels(*row, many=len(views) >= MANY) for row in rows]
 
 
 def _labels(
-    view: MatteView, evidence: Evidence, guess: np.ndarray, foreign: np.ndarray, many: bool
-) -> np.ndarray:
+    view: MatteView, evidence: Evidence, guess: np.ndarray, shirt: np.ndarray, foreign: np.ndarray,
+    many: bool,
+) -> np.ndarray:  # fmt: skip
     """Return GrabCut labels (h, w) from a view's mask, the other views' evidence, and the guess.
 
     GrabCut learns the person's colours where no other view sees the wall and no pixel is `foreign`
     (h, w). Large foreign patches are labelled wall. What all others see as the person is certain
-    only if they are `many`; else it is likely where the guess has a person as well.
+    only if they are `many`; else it is likely where the guess has a person as well. A `shirt` of
+    the wall's colour (h, w) is certain, because others may have lost it too.
     """
     solid, certain = evidence.solid, guess == cv2.GC_FGD
     if many:
@@ -429,7 +462,7 @@ def _labels(
     patches = cv2.morphologyEx(foreign.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))) > 0
     beyond |= patches & ~certain
     labels[beyond | ~view.valid] = cv2.GC_BGD
-    labels[sure] = cv2.GC_FGD
+    labels[sure | shirt] = cv2.GC_FGD
     return labels
 
 

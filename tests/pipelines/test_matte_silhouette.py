@@ -15,11 +15,13 @@ from express50.geometry.transforms import look_at, transform_points
 from express50.head.load import load_head
 from pipelines.matte import silhouette
 from pipelines.matte.cutout import (
+    SHIRT,
     CutView,
     HeadPlace,
     average_person,
     chin_and_above,
     guess_person,
+    shirts_like_the_wall,
     trunk_of_a_person,
 )
 from pipelines.matte.silhouette import (
@@ -79,6 +81,7 @@ def test_chances_come_back_to_their_pixels_and_are_negative_elsewhere() -> None:
         (3, 0.03, cv2.GC_BGD, cv2.GC_PR_BGD),  # few cameras: sure about heads, not about bodies
         (3, 0.003, cv2.GC_BGD, cv2.GC_BGD),
         (3, 0.97, cv2.GC_PR_FGD, cv2.GC_PR_FGD),
+        (3, 0.995, cv2.GC_FGD, cv2.GC_PR_FGD),
         (8, 0.03, cv2.GC_BGD, cv2.GC_PR_FGD),  # many cameras: they decide about bodies
         (8, 0.97, cv2.GC_FGD, cv2.GC_PR_FGD),
     ],
@@ -98,9 +101,26 @@ def test_the_network_decides_about_heads_sooner_than_about_bodies(
     shown = enlarged(np.ones((CROP, CROP), np.float32), crop, view.valid.shape) > 0
     likely = (average_person(view, place) == cv2.GC_PR_FGD) & shown
     body = average_person(view, place, {1: (trunk_of_a_person(),)}) > 0
-    for guess in guess_person([view] * views, place, [body] * views):
+    guesses, shirts = guess_person([view] * views, place, [body] * views)
+    for guess, shirt in zip(guesses, shirts, strict=True):
+        assert np.array_equal(shirt, body & shown & (chance > SHIRT))
         assert (likely & ~body).sum() > 500 and (guess[likely & ~body] == on_head).all()
         assert (likely & body).sum() > 500 and (guess[likely & body] == on_body).all()
+
+
+@pytest.mark.parametrize(("clutter", "kept"), [(1.0, True), (40.0, False)])
+def test_a_lost_shirt_is_kept_if_it_has_one_colour(clutter: float, kept: bool) -> None:
+    rng = np.random.default_rng(0)
+    camera = Camera("front", 96, 96, "PINHOLE", (100.0, 100.0, 48.0, 48.0), np.eye(4))
+    cells = np.clip(120 + clutter * rng.normal(size=(12, 12, 3)), 0, 255).astype(np.uint8)
+    wall = cv2.resize(cells, (96, 96), interpolation=cv2.INTER_NEAREST)
+    view = CutView(camera, wall, np.ones((96, 96), bool))
+    shirt, mask, guess = np.zeros((3, 96, 96), np.uint8)
+    shirt[50:], mask[:60], guess[:] = 1, 1, cv2.GC_PR_FGD
+    guess[:, :10] = cv2.GC_BGD  # somebody else
+    (found,) = shirts_like_the_wall([view], [shirt > 0], [guess], [mask > 0])
+    expected = (shirt > 0) & (guess != cv2.GC_BGD) & kept
+    assert np.array_equal(found, expected)
 
 
 def test_damaged_weights_are_named(tmp_path: Path) -> None:
