@@ -20,10 +20,10 @@ from torch import Tensor
 
 from express50.console import count, figure_label, format_seconds, format_table, log
 from express50.contract.segmentation_labels import label_mask
-from express50.errors import ConfigError, DivergedError, FormatError, few
+from express50.errors import CaptureError, ConfigError, DivergedError, FormatError, few
 from express50.files.atomic import naming_full_disk, write_csv, write_json
-from express50.files.containers import to_srgb
-from express50.files.images import read_image, write_image
+from express50.files.containers import read_srgb
+from express50.files.images import write_image
 from express50.files.text import is_number, no_folder
 from express50.shards.writer import sample_key
 from grmm.checkpoint import Checkpoint
@@ -253,8 +253,8 @@ def score(
         path = paths[index]
         rows_seen, columns_seen, size = window(index)
         try:
-            pixels = to_srgb(read_image(path))
-        except FormatError as error:
+            pixels = read_srgb(path)
+        except CaptureError as error:
             wrong.append(str(error))
             continue
         if pixels.shape[:2] != size:

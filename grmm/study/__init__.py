@@ -24,8 +24,8 @@ import numpy as np
 
 from express50.errors import ConfigError, FormatError
 from express50.files.atomic import write_bytes, write_json
-from express50.files.containers import to_srgb
-from express50.files.images import encode_png, read_image
+from express50.files.containers import read_srgb
+from express50.files.images import encode_png
 from express50.files.text import markdown_table, no_folder, parse_json, read_json_table
 from express50.local_server import NOT_FOUND, PageServer, Reply
 
@@ -121,7 +121,7 @@ def _copy(path: Path, out: Path, seed: int) -> str:
     The digest is of what the picture shows and where it came from. Two methods that made the same
     picture must not be recognised by a shared address either.
     """
-    data = encode_png(to_srgb(read_image(path)))
+    data = encode_png(read_srgb(path))
     digest = hashlib.sha256(f"{seed} {path.parent} {path.stem} ".encode() + data).hexdigest()[:24]
     write_bytes(out / "pictures" / f"{digest}.png", data)
     return f"pictures/{digest}.png"

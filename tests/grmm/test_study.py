@@ -11,8 +11,9 @@ from itertools import product
 
 import numpy as np
 import pytest
+import tifffile
 
-from express50.errors import ConfigError, FormatError
+from express50.errors import CaptureError, ConfigError, FormatError
 from express50.files.images import write_image
 from grmm.cli import main
 from grmm.study import (
@@ -334,6 +335,15 @@ def test_an_answer_that_cannot_be_written_is_said_where_the_server_runs(study, c
             server.shutdown()
             thread.join()
     assert "a request failed: IsADirectoryError: " in capsys.readouterr().err
+
+
+def test_a_picture_that_is_not_finite_is_named(folders, tmp_path):
+    image = np.full((8, 8, 3), np.nan, np.float32)
+    tifffile.imwrite(tmp_path / "x.tif", image, photometric="rgb")
+    for path in folders["ours"].iterdir():  # their content decides, not their name
+        shutil.copy(tmp_path / "x.tif", path)
+    with pytest.raises(CaptureError, match=r"_cam01.png: image holds NaN .*; export it again"):
+        made_in(tmp_path / "out", folders)
 
 
 def test_too_few_common_pictures_are_refused(folders, tmp_path):
