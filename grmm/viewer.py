@@ -184,10 +184,7 @@ class Viewer:
         self._add_controls()
         self.head = self._described()
         self.server.on_client_connect(self._join)
-
-        @self.server.on_client_disconnect
-        def leave(client: viser.ClientHandle) -> None:
-            self._watchers.pop(client.client_id, None)
+        self.server.on_client_disconnect(self._leave)
 
     def run(self) -> None:
         """Draw until `stop` (or Ctrl-C)."""
@@ -247,6 +244,9 @@ class Viewer:
 
         client.camera.on_update(camera_moved)
         self._wake.set()
+
+    def _leave(self, client: viser.ClientHandle) -> None:
+        self._watchers.pop(client.client_id, None)
 
     def _head_moved(self, event: object = None) -> None:
         self._head_changed = time.perf_counter()
