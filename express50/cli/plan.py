@@ -193,7 +193,7 @@ def measure_sizes(
     figures = read_measured(dial_dir(dataset) / "measured.json")
     trials = figures.trials if figures else []
     if not trials or dataset.subjects():
-        costs = measure(dataset, known)
+        costs = measure(dataset, known)  # first: it says that a folder is not a dataset
         found = [(footage_of(dataset), costs)]
     else:
         seen = trials[0]

@@ -32,7 +32,7 @@ def why_outdated(
     if changed := differing(made.inputs, inputs):
         # An input's name may hold the item's expression; without it, items share their reason.
         own = item.split("/")
-        short = [" ".join(w for w in name.split(" ") if w not in own) for name in changed]
+        short = [" ".join(w for w in name.split(" ") if w not in own) or name for name in changed]
         words.append(f"inputs changed: {few(short, NAMED)}")
     then, now = made.settings, config_texts(config)
     if then and (names := differing(then, now)):
