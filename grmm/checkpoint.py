@@ -6,7 +6,7 @@ Writes are atomic. Reads use ``weights_only``, so nothing in a checkpoint is exe
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from grmm.model import GRMM, PinholeView
 from grmm.networks import Networks
 
 FORMAT = "grmm.checkpoint/1"
+TRAINING = "training_"  # in a fit, before the names of training's cameras
 PARAMETERS = ("shape", "expression", "neck", "jaw", "eyes", "R", "t")  # of a frame
 
 
@@ -42,7 +43,7 @@ class Gallery:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Checkpoint:
-    """A trained model, ready to use; ``loop`` and ``optimizer`` serve `train` alone."""
+    """A trained or fitted model, ready to use; ``loop`` and ``optimizer`` are for resuming."""
 
     config: Config
     head_spec: str
@@ -51,6 +52,8 @@ class Checkpoint:
     gallery: Gallery
     optimizer: dict[str, Any]
     loop: dict[str, Any]
+    seen_before: frozenset[tuple[str, str]] | None = None
+    """Of a fit: expressions and cameras in which training saw the person. Of a training: None."""
 
     def views(self, source: Source) -> HeadViews:
         """Prepare the samples of a source as the training data were.
@@ -87,6 +90,7 @@ def save_checkpoint(
     config: Config,
     head_spec: str,
     gallery: Gallery,
+    seen_before: Collection[tuple[str, str]] | None = None,
     optimizer: dict[str, Any] | None = None,
     loop: dict[str, Any] | None = None,
 ) -> None:
@@ -123,6 +127,7 @@ def save_checkpoint(
             name: vars(view) | {"K": view.K.cpu(), "cam_from_head": view.cam_from_head.cpu()}
             for name, view in gallery.cameras.items()
         },
+        "seen_before": None if seen_before is None else sorted(seen_before),
         "optimizer": optimizer or {},
         "loop": loop or {},
     }
@@ -148,6 +153,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoin
             head=head,
             model=_build(path, config.model, head, content).to(device),
             gallery=_gallery(path, content, head, device),
+            seen_before=seen_before(content),
             optimizer=content["optimizer"],
             loop=content["loop"],
         )
@@ -185,6 +191,16 @@ def read_content(path: Path) -> dict[str, Any]:
             " or make it again with --overwrite"
         )
     return content
+
+
+def seen_before(content: dict[str, Any]) -> frozenset[tuple[str, str]] | None:
+    """Return what `Checkpoint.seen_before` says of a file's content."""
+    if "seen_before" in content:
+        pairs = content["seen_before"]
+        return None if pairs is None else frozenset(map(tuple, pairs))
+    # Earlier versions' fits are known by the names of training's cameras in them alone.
+    fitted = any(name.startswith(TRAINING) for name in content.get("cameras", {}))
+    return frozenset() if fitted and "iteration" not in content.get("loop", {}) else None
 
 
 def write_content(path: Path, content: dict[str, Any]) -> None:

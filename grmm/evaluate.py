@@ -78,6 +78,8 @@ def kind_of(loaded: Checkpoint, key: SampleKey) -> str:
     """Return whether a checkpoint has seen a sample, or how it was held out."""
     if key.subject not in loaded.model.subjects:
         return HELD_IDENTITY
+    if (key.expression, key.camera) in (loaded.seen_before or ()):
+        return SEEN
     if key.frame not in loaded.gallery.frames:
         return HELD_EXPRESSION
     return SEEN if key.camera in loaded.gallery.cameras else HELD_VIEW

@@ -30,7 +30,7 @@ from grmm.checkpoint import Checkpoint
 from grmm.config import as_tables
 from grmm.data import HeadView, HeadViews, Shuffle, with_codes
 from grmm.edit import HeadCodes, between, trained_head
-from grmm.evaluate import HELD_IDENTITY, Journal, Row, evaluate, mean
+from grmm.evaluate import HELD_IDENTITY, SEEN, Journal, Row, evaluate, kind_of, mean
 from grmm.fit_state import (
     FitState,
     Scores,
@@ -72,6 +72,7 @@ def fit(
 ) -> dict[str, object]:
     """Fit one subject from the views ``given``; report on them and on ``held_out``.
 
+    Views that training saw, of a person who was in training, do not count as held out.
     Every expression among the views gets its own z_exp; z_id is common. Writes OUT/checkpoint.pt
     (the tuned model, whose only subject is the fitted one), OUT/metrics.json and OUT/*.jpg. The
     checkpoint is saved as `grmm train` saves its own. ``continued`` goes on from the one in OUT,
@@ -89,7 +90,11 @@ def fit(
     made_from = inputs(state)
     if continued:
         resume(state, checkpoint, made_from)
-    held_out = [i for i in held_out if views.keys[i].expression in state.z_exp]
+    held_out = [
+        i
+        for i in held_out
+        if views.keys[i].expression in state.z_exp and kind_of(loaded, views.keys[i]) != SEEN
+    ]
     keeping = partial(_kept, state, checkpoint, made_from)
     effort = run_stages(state, lambda: _scores(state, held_out), keeping)
     rows = evaluate(views, held_out or state.given, state.render, judge)

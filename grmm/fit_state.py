@@ -15,16 +15,23 @@ from torch import Tensor
 from express50.console import log
 from express50.errors import ConfigError
 from grmm import losses
-from grmm.checkpoint import Checkpoint, Gallery, collect_gallery, load_checkpoint, save_checkpoint
+from grmm.checkpoint import (
+    TRAINING,
+    Checkpoint,
+    Gallery,
+    collect_gallery,
+    load_checkpoint,
+    save_checkpoint,
+)
 from grmm.config import Config
 from grmm.data import NO_OFFSETS, HeadView, HeadViews
 from grmm.edit import transfer
+from grmm.evaluate import SEEN, kind_of
 from grmm.model import GRMM, PinholeView, Rendering
 from grmm.train_state import CHANGEABLE, differences, refuse_changes
 
 Scores = dict[str, float | None]
 FIT = "fit"  # name of its state in a checkpoint's loop
-TRAINING = "training_"  # in a fit, before the names of training's cameras
 
 
 @dataclass(kw_only=True)
@@ -90,12 +97,6 @@ def start(loaded: Checkpoint, views: HeadViews, given: list[int]) -> FitState:
         perceptual=losses.load_vgg(loaded.config.loss.vgg16, codes.device),
         rng=np.random.default_rng(loaded.config.train.seed),
     )
-
-
-def is_fit(loaded: Checkpoint) -> bool:
-    """Return whether a checkpoint is of a fit: it does not know whom else training saw."""
-    fitted = any(name.startswith(TRAINING) for name in loaded.gallery.cameras)
-    return fitted and "iteration" not in loaded.loop
 
 
 def use_optimizer(state: FitState, optimizer: torch.optim.Optimizer) -> torch.optim.Optimizer:
@@ -196,6 +197,11 @@ def save_fit(
         config=state.config,
         head_spec=state.loaded.head_spec,
         gallery=Gallery(frames=own.frames | frames, cameras=cameras),
+        seen_before={
+            (key.expression, key.camera)
+            for key in state.views.keys
+            if key.subject == subject and kind_of(state.loaded, key) == SEEN
+        },
         optimizer=optimizer,
         loop=loop,
     )

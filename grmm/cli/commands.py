@@ -123,9 +123,8 @@ def config(args: argparse.Namespace) -> int:
 
 def fit(args: argparse.Namespace) -> int:
     """Fit an unseen person and report on the views that the fit did not use."""
-    from grmm.checkpoint import read_content
+    from grmm.checkpoint import read_content, seen_before
     from grmm.fit import fit
-    from grmm.fit_state import is_fit
     from grmm.shard_source import ShardSource, select
 
     check_results_folder(args.out)
@@ -134,16 +133,19 @@ def fit(args: argparse.Namespace) -> int:
         raise ConfigError(f"{made} is the checkpoint to fit from; name another folder")
     if made.exists() and args.overwrite:
         with suppress(FormatError):  # a damaged one may be replaced
-            if "shuffle" in read_content(made).get("loop", {}):
+            if seen_before(read_content(made)) is None:
                 raise ConfigError(f"{made} is of a training, not of a fit; name another folder")
     loaded = _load(args.checkpoint, [*args.set, *_metric_settings(args)], args.seconds)
-    if is_fit(loaded):
+    if loaded.seen_before is not None:
         log(
             f"{args.checkpoint} is a fit of {loaded.model.subjects[0]}: it knows one person only; "
             "fit people from a checkpoint of 'grmm train'"
         )
     elif args.subject in loaded.model.subjects:
-        log(f"{args.subject} was trained on, so the figures are not those of an unseen person")
+        log(
+            f"{args.subject} was trained on, so the figures are not those of an unseen person; only"
+            " views that training did not see count as held out"
+        )
     views = loaded.views(ShardSource(args.shards, "*"))
     given = select(views.keys, args.subject, args.expression, args.cameras)
     rest = sorted({*select(views.keys, args.subject, args.expression, "*")} - {*given})
@@ -278,7 +280,6 @@ def evaluate(args: argparse.Namespace) -> int:
     from express50.geometry.sampling import evenly
     from grmm.evaluate import SEEN, evaluate, journal_rows, kind_of, save_pictures, training_render
     from grmm.fit import FITS, evaluate_unseen, unseen_views
-    from grmm.fit_state import is_fit
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource
 
@@ -287,7 +288,7 @@ def evaluate(args: argparse.Namespace) -> int:
         check_results_folder(args.save)
     _require(args, "fit_cameras", "fit_budget")
     loaded = _load(args.checkpoint, _metric_settings(args), args.fit_budget)
-    if args.fit_cameras and is_fit(loaded):
+    if args.fit_cameras and loaded.seen_before is not None:
         raise ConfigError(
             f"{args.checkpoint} is a fit of {loaded.model.subjects[0]}: it does not hold whom"
             " training saw; --fit-cameras needs a checkpoint of 'grmm train'"

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -18,7 +19,7 @@ from express50.files.atomic import alone_in
 from express50.files.images import read_image
 from express50.files.video import BT601, EXACT, LIMITED
 from express50.shards.writer import PackedSample, ShardWriter
-from grmm.checkpoint import load_checkpoint, redact
+from grmm.checkpoint import load_checkpoint, read_content, redact, write_content
 from grmm.cli import build_parser, main
 from grmm.cli.commands import _edited_head, train_config
 from grmm.edit import trained_head
@@ -236,6 +237,8 @@ def test_people_who_are_known_or_left_out_are_named(checkpoint, shards, tmp_path
     short = ["--set=fit.stage1_iterations=0", "--set=fit.stage2_iterations=0"]
     assert main([*fit, "--cameras=cam00", *short]) == 0
     assert "S001 was trained on" in capsys.readouterr().err
+    metrics = json.loads((tmp_path / "f" / "metrics.json").read_text())
+    assert metrics["held_out_cameras"] == ["cam01"], "training saw the person in cam02"
     evaluate = ["evaluate", str(checkpoint), str(shards), str(tmp_path / "e"), "--images=1"]
     assert main(evaluate) == 0
     said = capsys.readouterr()
@@ -247,6 +250,13 @@ def test_people_who_are_known_or_left_out_are_named(checkpoint, shards, tmp_path
     assert main(evaluate) == 0
     said = capsys.readouterr().err
     assert "left out S000, S002" in said and "training did not see" not in said
+    kinds = ["--json", "--images=0"]
+    capsys.readouterr()
+    assert main([*evaluate, *kinds]) == 0
+    summary = json.loads(capsys.readouterr().out)["by_kind"]
+    assert {kind: row["images"] for kind, row in summary.items()} == {
+        "seen view": 4, "held-out view": 2,
+    }  # fmt: skip
     assert "e: its evaluation will be replaced; to keep it, stop and name" in said
     before = (tmp_path / "e" / "evaluation.csv").read_bytes()
     assert main([*evaluate, "--fit-cameras=cam00", "--fit-expression=e0"]) == 2
@@ -259,6 +269,31 @@ def test_a_training_that_one_person_is_left_of_is_not_taken_for_a_fit(checkpoint
     assert redact(copied, "S000")
     evaluate = ["evaluate", str(copied), str(shards), str(tmp_path / "e"), "--subjects=S002"]
     assert main([*evaluate, "--fit-cameras=cam00", "--fit-expression=e0"]) == 0
+
+
+def test_whether_a_checkpoint_is_of_a_fit_is_recorded(checkpoint, shards, tmp_path, capsys):
+    """Trainings with cameras of such names were taken for fits once a person was withdrawn."""
+    source = EllipsoidSource(subjects=3, size=32)
+    source.cameras = {f"training_{name}": pose for name, pose in source.cameras.items()}
+    source.keys = [replace(key, camera=f"training_{key.camera}") for key in source.keys]
+    write_shards(tmp_path / "s", source)
+    trained = tmp_path / "run" / "checkpoint.pt"
+    assert main(["train", str(tmp_path / "s"), str(trained.parent), *TINY]) == 0
+    assert redact(trained, "S000") and load_checkpoint(trained).seen_before is None
+    before = trained.read_bytes()
+    fit = ["fit", str(checkpoint), str(shards), str(trained.parent), "--subject=S002"]
+    assert main([*fit, "--overwrite"]) == 2
+    assert "is of a training, not of a fit" in capsys.readouterr().err
+    assert trained.read_bytes() == before
+
+    made = tmp_path / "fit" / "checkpoint.pt"
+    fit[3] = str(made.parent)
+    assert main(fit) == 0 and load_checkpoint(made).seen_before == frozenset()
+    for path, expected in ((made, frozenset()), (checkpoint, None)):
+        content = read_content(path)
+        del content["seen_before"]  # as earlier versions wrote it
+        write_content(tmp_path / "old.pt", content)
+        assert load_checkpoint(tmp_path / "old.pt").seen_before == expected
 
 
 def test_a_summary_names_a_metric_that_is_missing_once():
