@@ -22,6 +22,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
+from express50.console import count
 from express50.errors import ConfigError, FormatError
 from express50.files.atomic import write_bytes, write_json
 from express50.files.containers import read_srgb
@@ -311,9 +312,12 @@ def _percent(value: float | None, interval: Sequence[float] | None = None) -> st
 def make_server(out: Path, host: str = "127.0.0.1", port: int = 8000) -> PageServer:
     """Bind a server that does not serve yet; call ``serve_forever``.
 
-    Its address gives the page, ``trials?participant=3`` below it what that participant sees,
-    ``pictures/...`` the pictures; ``POST answers`` takes one answer. Nothing else of the folder can
-    be asked for: the assignment of methods to sides never leaves the server.
+    Its address gives the page, ``trials?participant=3&session=...`` below it what that participant
+    sees, ``pictures/...`` the pictures; ``POST answers`` takes one answer. Nothing else of the
+    folder can be asked for: the assignment of methods to sides never leaves the server.
+
+    A session is one opened page. A number belongs to the first that asks for it; another one takes
+    it over with ``&continue=yes`` alone, so that two people do not overwrite each other's answers.
 
     Raises:
         FormatError: OUT holds no study.
@@ -329,6 +333,7 @@ class StudyPages:
     def __init__(self, out: Path) -> None:
         """Read the study; a damaged file is reported now, not after an hour of answers."""
         self.out, self.study, self.lock = out, read_study(out), Lock()
+        self.sessions: dict[int, str] = {}  # of each participant
         read_answers(out, self.study)
         examples = self.study["examples"]
         self.pictures = {p for e in examples for p in (e["reference"], *e["pictures"].values())}
@@ -343,17 +348,33 @@ class StudyPages:
             return Reply(HTTPStatus.OK, "image/png", (self.out / name).read_bytes())
         if name != "trials":
             return NOT_FOUND
-        text, count = parse_qs(url.query).get("participant", [""])[0], self.study["participants"]
-        if not text.isdecimal() or len(text) > 9 or int(text) >= count:
-            message = f"participant is {text[:9]!r}, expected 0 to {count - 1}\n"
-            return Reply(HTTPStatus.BAD_REQUEST, "text/plain", message.encode())
-        number = int(text)
+        asked = {name: values[0] for name, values in parse_qs(url.query).items()}
+        text, session = asked.get("participant", ""), asked.get("session", "")
+        limit = self.study["participants"]
+        if not text.isdecimal() or len(text) > 9 or int(text) >= limit:
+            return _refusal(
+                HTTPStatus.BAD_REQUEST, f"participant is {text[:9]!r}, expected 0 to {limit - 1}"
+            )
+        return self.begin(int(text), session, continued="continue" in asked)
+
+    def begin(self, number: int, session: str, continued: bool) -> Reply:
+        """Return what one participant sees, unless another session has this number."""
         with self.lock:
             answers = read_answers(self.out, self.study)
+            done = [answer for answer in answers if answer["participant"] == number]
+            # Whoever answered before the server started can only be asked.
+            free = self.sessions.get(number, None if done else session) == session
+            if not free and not continued:
+                return _refusal(
+                    HTTPStatus.CONFLICT,
+                    f"Somebody has begun as number {number} and given {count(len(done), 'answer')}."
+                    " Continue only if this was you; otherwise cancel, and enter another number.",
+                )
+            self.sessions[number] = session
         content = {
             "trials": trials(self.study, number),
             "questions": self.study["questions"],
-            "done": [answer for answer in answers if answer["participant"] == number],
+            "done": done,
         }
         return Reply(HTTPStatus.OK, "application/json", json.dumps(content).encode())
 
@@ -363,14 +384,23 @@ class StudyPages:
             return NOT_FOUND
         if kind != "application/json":
             # Other sites' pages can post forms without asking, but not this type.
-            return Reply(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "text/plain", b"expected JSON\n")
+            return _refusal(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "expected JSON")
         content = body(ANSWER_LIMIT)
         if content is None:
-            return Reply(HTTPStatus.BAD_REQUEST, "text/plain", b"too long\n")
+            return _refusal(HTTPStatus.BAD_REQUEST, "too long")
         try:
-            answer = check_answer(self.study, parse_json(content, "answer", FormatError))
+            value = parse_json(content, "answer", FormatError)
+            answer = check_answer(self.study, value)
         except FormatError as error:
-            return Reply(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
+            return _refusal(HTTPStatus.BAD_REQUEST, str(error))
+        number, session = answer["participant"], value.get("session", "")
         with self.lock:
+            if self.sessions.setdefault(number, session) != session:
+                words = f"Number {number} is used on another page; reload this one to begin."
+                return _refusal(HTTPStatus.CONFLICT, words)
             append_answer(self.out, answer)
         return Reply(HTTPStatus.OK, "application/json", b"{}")
+
+
+def _refusal(status: HTTPStatus, words: str) -> Reply:
+    return Reply(status, "text/plain", f"{words}\n".encode())

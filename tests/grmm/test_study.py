@@ -18,6 +18,7 @@ from express50.files.images import write_image
 from grmm.cli import main
 from grmm.study import (
     PAGE,
+    StudyPages,
     append_answer,
     check_answer,
     make_server,
@@ -204,6 +205,29 @@ def test_page_shows_trials_and_takes_answers_and_nothing_else(study):
     assert read_answers(folder, made) == [answer]
 
 
+def test_two_people_with_one_number_do_not_overwrite_each_other(study):
+    """The later answers replaced the earlier ones unnoticed."""
+    folder, made = study
+    pages = StudyPages(folder)
+
+    def begin(session, more=""):
+        return pages.get(f"trials?participant=1&session={session}{more}")
+
+    def give(answer, session, pages=pages):
+        answer = {"participant": 1, "example": 0, "question": "identity", "answer": answer}
+        body = json.dumps(answer | {"session": session}).encode()
+        return pages.post("answers", "application/json", lambda limit: body).status
+
+    assert begin("a").status == 200 and begin("b").status == 409
+    assert give("A+", "a") == 200 and give("B+", "b") == 409
+    assert b"as number 1 and given 1 answer. Continue only" in begin("b").body
+    assert [answer["answer"] for answer in read_answers(folder, made)] == ["A+"]
+    pages = StudyPages(folder)  # the server was stopped and started
+    assert begin("b").status == 409 and begin("b", "&continue=yes").status == 200
+    assert json.loads(begin("b").body)["done"] == read_answers(folder, made)
+    assert give("=", "a", pages) == 409 and give("=", "b", pages) == 200
+
+
 SHOWN = """<script>
 setTimeout(() => { find("participant").value = 1; find("start").requestSubmit(); }, 200);
 setTimeout(() => {
@@ -271,6 +295,39 @@ def test_a_double_click_does_not_skip_an_example(study):
     assert (found["once"], found["then"]) == ("2 to go", "1 to go")
     wanted = [trial["example"] for trial in shown["trials"][:2] for _ in made["questions"]]
     assert [answer["example"] for answer in found["posts"]] == wanted
+
+
+TAKEN = """
+const elements = {}, urls = [], script = SCRIPT;
+const make = () => ({hidden: false, value: "", elements: {}, append() {}, replaceChildren() {}});
+globalThis.document = {getElementById: id => elements[id] ??= make(), createElement: make};
+globalThis.confirm = words => words === "taken" && urls.length > 1;
+globalThis.fetch = async url => {
+  urls.push(url.replace(/session=[^&]+/, "session"));
+  const taken = !url.includes("continue");
+  return {ok: !taken, status: taken ? 409 : 200, text: async () => "taken\\n",
+          json: async () => ({trials: [], done: [], questions: {}})};
+};
+(0, eval)(script);
+const event = {preventDefault() {}};
+document.getElementById("participant").value = "1";
+elements.start.onsubmit(event).then(async () => {
+  const cancelled = [elements.error.textContent, elements.start.hidden];
+  await elements.start.onsubmit(event);
+  console.log(JSON.stringify({cancelled, urls, begun: elements.start.hidden}));
+});
+"""
+
+
+def test_the_page_asks_whoever_enters_a_used_number():
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+    script = PAGE.read_text().split("<script>")[1].split("</script>")[0]
+    code = TAKEN.replace("SCRIPT", json.dumps(script))
+    run = subprocess.run(["node", "-e", code], capture_output=True, text=True, check=True)
+    found, url = json.loads(run.stdout), "trials?participant=1&session"
+    assert found["cancelled"] == ["taken", False] and found["begun"]
+    assert found["urls"] == [url, url, f"{url}&continue=yes"]
 
 
 @pytest.mark.parametrize(
