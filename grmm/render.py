@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from express50.console import log
 from express50.dataset import tracks
 from express50.errors import ConfigError, check_known
 from express50.files.images import contact_sheet, write_image
@@ -38,6 +39,11 @@ YAWS, PITCHES = (-60, -30, 0, 30, 60), (20, 0, -20)  # degrees of the sheet of n
 Sheet = tuple[list[list[np.ndarray]], list[str], list[str]]
 """Rows of pictures, a label per row, a caption per column."""
 COLUMNS = "footage, refined, drawn, depth, error times four"  # of comparison sheets
+FILES = (
+    "turntable.mp4", "interpolation.mp4", "driven.mp4", "samples.jpg", "views.jpg", "controls.jpg",
+    "transfer.jpg",
+)  # fmt: skip
+"""What `grmm render` draws if asked to."""
 STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 TURNS = {"neck, yaw": ("neck.1", 0.35), "eyes, yaw": ("eyes", 0.4)}  # radians of a step of 1
 CONTROL_ROWS = 9  # most rows of `control_sheet`
@@ -315,6 +321,18 @@ def read_clips(path: Path, cue: str | None = None) -> tracks.Sequence:
     rows = [i for i, name in enumerate(clips.cues) if name == cue]
     parts = {name: getattr(clips, name)[rows] for name in tracks.OF_FRAMES}
     return replace(clips, cues=(cue,) * len(rows), **parts)
+
+
+def set_aside(folder: Path, drawn: Collection[str]) -> None:
+    """Move FILES of earlier calls, perhaps of another head, away; ``drawn`` are stems that stay."""
+    paths = (folder / name for name in FILES)
+    if old := [path for path in paths if path.stem not in drawn and path.is_file()]:
+        earlier = folder / "earlier"
+        earlier.mkdir(exist_ok=True)
+        for path in old:
+            path.replace(earlier / path.name)
+        names = ", ".join(path.name for path in old)
+        log(f"moved to {earlier}, because an earlier call drew it: {names}")
 
 
 def write_sheet(

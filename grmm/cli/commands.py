@@ -77,7 +77,7 @@ def train_config(args: argparse.Namespace) -> Config:
     name: str = args.preset
     changes: dict[str, dict[str, Any]] = {}
     if name == AUTO:
-        name, changes = _machines_choice(args.seconds)
+        name, changes = _machines_choice(args)
     config = resolve(name, args.config, [*args.set, *_metric_settings(args)], changes)
     if args.seconds is not None:
         config = replace(config, train=replace(config.train, seconds=args.seconds))
@@ -86,7 +86,7 @@ def train_config(args: argparse.Namespace) -> Config:
     return replace(config, data=replace(config.data, **held))
 
 
-def _machines_choice(seconds: float | None) -> tuple[str, dict[str, dict[str, Any]]]:
+def _machines_choice(args: argparse.Namespace) -> tuple[str, dict[str, dict[str, Any]]]:
     """Choose a preset and changes to it that suit the machine, and print the choice."""
     from grmm.train_state import gpu
 
@@ -95,7 +95,8 @@ def _machines_choice(seconds: float | None) -> tuple[str, dict[str, dict[str, An
         preset = "paper-plus" if memory >= PAPER_GIB else "small"
         log(f"auto: {preset}, for {name} with {memory:.0f} GiB")
         return preset, {}
-    if seconds is None:
+    seconds = args.seconds or resolve("demo", args.config, args.set).train.seconds
+    if not seconds:
         raise ConfigError(
             f"no GPU found; on a CPU --preset {AUTO} needs a time budget: --budget 1h"
         )
@@ -221,6 +222,7 @@ def render(args: argparse.Namespace) -> int:
     draw("grid", render.expression_grid, subjects, expressions, view)
     picture = render.picture(loaded, head, view)
     args.out.mkdir(parents=True, exist_ok=True)
+    render.set_aside(args.out, {*videos, *sheets})
     write_image(args.out / "picture.png", picture)
     say(f"wrote {args.out / 'picture.png'}")
     for name, frames in videos.items():

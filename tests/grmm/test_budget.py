@@ -56,6 +56,17 @@ def test_a_gpu_is_trained_on_at_the_size_that_it_holds(monkeypatch, capsys, memo
     assert f"{preset}, for Some GPU with {memory} GiB" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("by_file", [True, False])
+def test_a_time_among_the_settings_is_enough(tmp_path, by_file, capsys):
+    """It asked for --budget."""
+    (tmp_path / "c.toml").write_text("[train]\nseconds = 90.0\n")
+    given = f"--config={tmp_path / 'c.toml'}" if by_file else "--set=train.seconds=90"
+    assert train_config(arguments("--preset", "auto", given)) == resolve(
+        "demo", changes={"train": {"seconds": 90.0}}
+    )
+    assert choose(90).setting in capsys.readouterr().err
+
+
 def test_a_cpu_needs_a_time():
     with pytest.raises(ConfigError, match="--budget"):
         train_config(build_parser().parse_args(["train", "shards", "out"]))

@@ -186,6 +186,21 @@ def test_render_writes_a_picture_per_frame_and_pair(checkpoint, tmp_path, capsys
     assert grid.shape[0] >= 2 * picture.shape[0] and grid.shape[1] >= 2 * picture.shape[1]
 
 
+def test_render_sets_aside_what_an_earlier_call_drew(checkpoint, tmp_path, capsys):
+    """A sheet of another head stayed beside the new picture."""
+    render = ["render", str(checkpoint), str(tmp_path)]
+    assert main([*render, "--views", "--controls"]) == 0
+    views = (tmp_path / "views.jpg").read_bytes()
+    (tmp_path / "notes.txt").write_text("mine")
+    capsys.readouterr()
+    assert main([*render, "--subject=S001", "--controls"]) == 0
+    shown = {"picture.png", "grid.jpg", "controls.jpg", "notes.txt", "earlier"}
+    assert {path.name for path in tmp_path.iterdir()} == shown
+    assert [path.name for path in (tmp_path / "earlier").iterdir()] == ["views.jpg"]
+    assert (tmp_path / "earlier" / "views.jpg").read_bytes() == views
+    assert "an earlier call drew it: views.jpg\n" in capsys.readouterr().err
+
+
 def test_residual_codes_of_others_leave_the_mesh_as_it_is(checkpoint, tmp_path):
     loaded, given = load_checkpoint(checkpoint), ["render", str(checkpoint), str(tmp_path)]
     given += ["--subject=S000", "--expression=e0"]
