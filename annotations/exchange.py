@@ -37,7 +37,7 @@ from express50.console import count
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, check_known
 from express50.files.atomic import write_bytes
-from express50.files.text import NAME, csv_table, parse_json, read_text
+from express50.files.text import NAME, csv_table, parse_json, read_text, refusing
 
 LARGEST = 2**63
 ROUNDED_S = 0.5  # by which a spreadsheet that shows whole seconds changes a time
@@ -141,14 +141,12 @@ def read_table(path: Path) -> list[Label]:
             {k: v.removeprefix("'") if _FORMULA.match(str(v)) else v for k, v in row.items()}
             for row in table
         )
-    try:
+    with refusing(AnnotationError, f"{path}: not CSV", "export it again", (csv.Error,)):
         labels = [
             _label(row, f"{path}: row {number}")
             for number, row in enumerate(rows, 1)
             if is_json or any(row.values())  # spreadsheets write rows of empty cells
         ]
-    except csv.Error as error:
-        raise AnnotationError(f"{path}: not CSV ({error}); export it again") from None
     if not is_json and not labels and set(REQUIRED) - set(table.fieldnames or REQUIRED):
         raise AnnotationError(f"{path}: not a table of labels, which have {', '.join(REQUIRED)}")
     return labels

@@ -11,7 +11,7 @@ from annotations.labels import current_labels, read_labels
 from express50.contract.layout import Dataset, included_subjects
 from express50.errors import AnnotationError, FormatError, StageError, advised, check_known
 from express50.files.atomic import write_json
-from express50.files.text import read_json_table
+from express50.files.text import read_json_table, refusing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
     if not path.is_file():
         return {}
     fix = f"run {advised('express50 align', dataset.root)} again"
-    try:
+    with refusing(FormatError, f"{path}: not a table of suggestions", fix):
         rows = read_json_table(path, FormatError, fix)
         found = {expression: Suggested(**row) for expression, row in rows.items()}
         for expression, row in found.items():
@@ -52,8 +52,6 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
                 raise ValueError(f"{expression}: confidence is {row.confidence}, expected 0 to 1")
             if not all(map(math.isfinite, [*row.activity, *(row.match or ())])):
                 raise ValueError(f"{expression}: its curves hold NaN or infinity")
-    except (ValueError, TypeError, AttributeError, OverflowError) as error:
-        raise FormatError(f"{path}: not a table of suggestions ({error}); {fix}") from None
     return found
 
 

@@ -24,6 +24,7 @@ from express50.contract.stage import Note, Result
 from express50.errors import FormatError, StageError, advised, rounded_down
 from express50.files.arrays import read_arrays
 from express50.files.images import contact_sheet, write_image
+from express50.files.text import refusing
 from express50.geometry.transforms import scale_of, similarity_fit, transform_points
 
 if TYPE_CHECKING:
@@ -59,14 +60,12 @@ def read_observations(dataset: Dataset, subject: str) -> FaceObservations:
     fix = f"run {advised('express50 align', dataset.root)}"
     if not path.is_file():
         raise StageError(f"{path}: {subject!r} is not observed; {fix}")
-    try:
+    with refusing(FormatError, f"{path}: not observations", fix):
         table = read_arrays(path, FormatError, "observations", fix=fix)
         if str(table["schema"]) != SCHEMA:
             raise ValueError(f"schema is {table['schema']}, expected {SCHEMA}")
         rest = (table[key] for key in ("frames", "points", "scores", "faces"))
         return FaceObservations(tuple(map(str, table["cameras"])), *rest)
-    except (ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"{path}: not observations ({error}); {fix}") from None
 
 
 def run(

@@ -39,7 +39,7 @@ from express50.files.images import (
     shrink,
     upright,
 )
-from express50.files.text import read_json, read_json_table
+from express50.files.text import read_json, read_json_table, refusing
 from express50.files.video import VideoReader
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import undistort_image
@@ -398,17 +398,12 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
     path = dataset.gains_file(subject)
     if not path.is_file():
         return {}
-    try:
+    with refusing(FormatError, f"{path}: not a table of gains", "calibrate again"):
         rows = read_json_table(path, FormatError, "calibrate again")
         gains = {name: np.array(row, float) for name, row in rows.items()}
-    except (ValueError, TypeError, OverflowError) as error:
-        raise FormatError(f"{path}: not a table of gains ({error}); calibrate again") from error
-    for name, gain in gains.items():
-        if gain.shape != (3,) or not np.isfinite(gain).all() or (gain <= 0).any():
-            raise FormatError(
-                f"{path}: {name} is {gain.tolist()}, expected three numbers above 0; "
-                "calibrate again"
-            )
+        for name, gain in gains.items():
+            if gain.shape != (3,) or not np.isfinite(gain).all() or (gain <= 0).any():
+                raise ValueError(f"{name} is {gain.tolist()}, expected three numbers above 0")
     return gains
 
 

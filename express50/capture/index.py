@@ -11,7 +11,7 @@ from typing import Any
 from express50.contract.layout import Dataset, footage_root
 from express50.errors import CaptureError, FormatError, StageError, advised
 from express50.files.digests import cached_by_file, file_version
-from express50.files.text import NAME, read_json_table
+from express50.files.text import NAME, read_json_table, refusing
 
 SCHEMA = "express50.index/1"
 # `Index.calibration` of a capture in another layout: ingest writes its cameras beside the index.
@@ -116,14 +116,10 @@ def _read_cached(path: Path, dataset: Dataset, subject: str, captures_version: H
             f"{dataset.captures_file}: subject {subject!r} has no capture; "
             f"run {advised('express50 ingest', dataset.root, 'CAPTURE')}"
         )
-    root = footage_root(captures[subject])
-    try:
+    fix = f"delete its folder and run {advised('express50 ingest', dataset.root)}"
+    with refusing(FormatError, f"{path}: not an index", fix):
+        root = footage_root(captures[subject])
         return index_from_json(read_json_table(path, FormatError), root)
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise FormatError(
-            f"{path}: not an index ({type(error).__name__}: {error}); "
-            f"delete its folder and run {advised('express50 ingest', dataset.root)}"
-        ) from error
 
 
 def index_to_json(index: Index) -> dict[str, Any]:
@@ -225,17 +221,15 @@ def read_peak_rows(dataset: Dataset, subject: str) -> dict[str, Peak]:
     path, align = dataset.peaks_file(subject), advised("express50 align", dataset.root)
     if not path.is_file():
         raise StageError(f"{path}: subject {subject!r} is not aligned; run {align}")
-    try:
-        rows = read_json_table(path, FormatError, f"run {align} again")
+    fix = f"run {align} again"
+    with refusing(FormatError, f"{path}: not a table of peaks", fix):
+        rows = read_json_table(path, FormatError, fix)
         if strange := [name for name in rows if not NAME.fullmatch(name)]:
             raise ValueError(f"expression {strange[0]!r} is not an id")  # it names a folder
         return {
             name: Peak(int(row["frame"]), str(row["camera"]), row["pts"], row["dhash"])
             for name, row in rows.items()
         }
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        problem = f"{type(error).__name__}: {error}"
-        raise FormatError(f"{path}: not a table of peaks ({problem})") from error
 
 
 def same_hash(one: str, other: str | None) -> bool:

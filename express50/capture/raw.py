@@ -28,6 +28,7 @@ from express50.files.text import (
     no_folder,
     read_text,
     read_toml,
+    refusing,
     unreadable,
 )
 from express50.files.video import common_fps
@@ -397,7 +398,7 @@ def read_cues(path: Path) -> tuple[Cue, ...]:
         return ()
     text = read_text(path, CaptureError, TOML_LIMIT)
     reader, head = csv_table(text, skipinitialspace=True), text.partition("\n")[0]
-    try:
+    with refusing(CaptureError, f"{path}: not CSV", errors=(csv.Error,)):
         missing = [name for name in CUE_COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
             raise CaptureError(
@@ -406,8 +407,6 @@ def read_cues(path: Path) -> tuple[Cue, ...]:
             )
         # Spreadsheets write rows of empty cells below a table that was once longer.
         cues = [_read_cue(path, reader.line_num, row) for row in reader if any(row.values())]
-    except csv.Error as error:
-        raise CaptureError(f"{path}: not CSV ({error}); write it again") from error
     seen: set[str] = set()
     for cue in cues:
         if cue.expression_id in seen:

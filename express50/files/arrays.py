@@ -28,7 +28,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from express50.errors import Express50Error, HeadModelError
-from express50.files.text import AGAIN, Kind, no_file, open_file, reason, unreadable
+from express50.files.text import AGAIN, Kind, no_file, open_file, reason, refusing, unreadable
 
 SIZE_LIMIT = 2 << 30  # bytes per unpacked file; 60 expressions of a 26,000-vertex head take 19 MB
 HEADER_LIMIT = 4096  # characters in an array's header
@@ -314,14 +314,12 @@ def read_pickle(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
         HeadModelError: the file is unreadable, damaged, or names a class that is not on the allow
             list.
     """
-    try:
+    with refusing(HeadModelError, f"{path}: refused or damaged pickle", errors=DAMAGE):
         size = path.stat().st_size
         if size > SIZE_LIMIT:
             raise HeadModelError(f"{path}: {size} bytes, expected at most {SIZE_LIMIT}")
         with open_file(path) as file:
             return SafeUnpickler(file, encoding="latin1").load()
-    except DAMAGE as error:
-        raise HeadModelError(f"{path}: refused or damaged pickle ({reason(error)})") from error
 
 
 def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
@@ -330,14 +328,12 @@ def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file hol
     Raises:
         HeadModelError: as for `read_pickle`.
     """
-    try:
-        with open_file(path) as file:
-            shape, dtype = read_header(file)
-            if not dtype.hasobject:
-                return read_npy(path, HeadModelError, "an array")
-            content = SafeUnpickler(file, encoding="latin1").load()
-    except DAMAGE as error:
-        raise HeadModelError(f"{path}: refused or damaged array ({reason(error)})") from error
+    words = f"{path}: refused or damaged array"
+    with refusing(HeadModelError, words, errors=DAMAGE), open_file(path) as file:
+        shape, dtype = read_header(file)
+        if not dtype.hasobject:
+            return read_npy(path, HeadModelError, "an array")
+        content = SafeUnpickler(file, encoding="latin1").load()
     return content.item() if isinstance(content, np.ndarray) and shape == () else content
 
 
@@ -350,10 +346,8 @@ def to_array(value: object, name: str, where: str) -> np.ndarray:
     for _ in range(8):  # they may be nested; the limit ends a cycle
         if isinstance(value, ChumpyArray):
             value = next((value.state[key] for key in ("x", "a", "v") if key in value.state), None)
-    try:
+    with refusing(HeadModelError, f"{where}: {name} is not an array", errors=DAMAGE):
         array = value.dense() if isinstance(value, SparseMatrix) else np.asarray(value)
-    except (ValueError, TypeError, OverflowError, KeyError, IndexError, MemoryError) as error:
-        raise HeadModelError(f"{where}: {name} is not an array ({reason(error)})") from error
     if array.dtype.kind not in "fiub":
         raise HeadModelError(f"{where}: {name} holds {array.dtype}, expected numbers")
     if array.size > VALUES_LIMIT:

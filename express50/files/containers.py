@@ -11,8 +11,6 @@ from __future__ import annotations
 import io
 import warnings
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -25,7 +23,7 @@ from express50.errors import CaptureError, FormatError
 from express50.files.arrays import DAMAGE as ARRAY_DAMAGE
 from express50.files.digests import cached_by_file
 from express50.files.images import decode_cv, linear_to_srgb, read_image, upright
-from express50.files.text import check_readable, read_bytes
+from express50.files.text import check_readable, read_bytes, refusing
 from express50.geometry.shapes import PIXEL_LIMIT
 
 WITHIN = "!/"
@@ -111,16 +109,14 @@ def decode_picture(data: bytes, where: str) -> np.ndarray:
     Raises:
         CaptureError: the bytes are not such an image, or the image has too many pixels.
     """
-    try:
-        with (
-            warnings.catch_warnings(action="ignore"),  # Pillow's limit is lower than ours
-            Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "AVIF")) as header,
-        ):
-            width, height = header.size
-    except (*ARRAY_DAMAGE, Image.DecompressionBombError) as error:
-        raise CaptureError(
-            f"{where}: {len(data)} bytes are not a JPEG, PNG or AVIF image; copy the file again"
-        ) from error
+    not_one = f"{where}: {len(data)} bytes are not a JPEG, PNG or AVIF image"
+    damage = (*ARRAY_DAMAGE, Image.DecompressionBombError)
+    with (
+        refusing(CaptureError, not_one, errors=damage),
+        warnings.catch_warnings(action="ignore"),  # Pillow's limit is lower than ours
+        Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "AVIF")) as header,
+    ):
+        width, height = header.size
     if width * height > PIXEL_LIMIT:
         raise CaptureError(f"{where}: {width}x{height} pixels, expected at most {PIXEL_LIMIT}")
     try:
@@ -148,7 +144,7 @@ def member_bytes(path: Path, member: str) -> bytes:
     archive = open_zip(path)
     if member not in archive.NameToInfo:
         raise CaptureError(f"{path}: has no member {member}; copy it again")
-    with _damage_is_one_error(ARRAY_DAMAGE, f"{where}: damaged"):
+    with refusing(CaptureError, f"{where}: damaged", errors=ARRAY_DAMAGE):
         _check_size(archive.getinfo(member).file_size, where)
         return archive.read(member)
 
@@ -158,19 +154,10 @@ def _check_size(size: int, where: str) -> None:
         raise CaptureError(f"{where}: {size} bytes, expected at most {BYTES_LIMIT}; it is damaged")
 
 
-@contextmanager
-def _damage_is_one_error(kinds: tuple[type[BaseException], ...], words: str) -> Iterator[None]:
-    """Turn what libraries raise on damaged files into one CaptureError."""
-    try:
-        yield
-    except kinds as error:
-        raise CaptureError(f"{words} ({error}); copy the file again") from error
-
-
 def open_zip(path: Path) -> zipfile.ZipFile:
     """Open a zip, the last few stay open; CaptureError if it is missing or not a zip."""
     check_readable(path)
-    with _damage_is_one_error(ARRAY_DAMAGE, f"{path}: not a zip archive"):
+    with refusing(CaptureError, f"{path}: not a zip archive", errors=ARRAY_DAMAGE):
         return _open_zip(path)
 
 
@@ -182,7 +169,7 @@ def open_hdf5(path: Path) -> h5py.File:
     if path.is_dir():
         raise CaptureError(f"{path}: is a folder, expected an HDF5 file such as .smc")
     check_readable(path)
-    with _damage_is_one_error(DAMAGE, f"{path}: cannot be opened as HDF5"):
+    with refusing(CaptureError, f"{path}: cannot be opened as HDF5", errors=DAMAGE):
         return _hdf5_of(path, "r")
 
 
@@ -198,7 +185,7 @@ def child(file: h5py.File, name: str) -> Any:
         CaptureError: a part of the path is a link, or the file is damaged.
     """
     node: Any = file
-    with _damage_is_one_error(DAMAGE, f"{file.filename}: {name} is damaged"):
+    with refusing(CaptureError, f"{file.filename}: {name} is damaged", errors=DAMAGE):
         for part in name.split("/"):
             link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
             if link is None:
@@ -213,13 +200,15 @@ def child(file: h5py.File, name: str) -> Any:
 
 def members(group: h5py.Group) -> list[str]:
     """List the names in a group of an HDF5 file; CaptureError if the file is damaged."""
-    with _damage_is_one_error(DAMAGE, f"{group.file.filename}: a group is damaged"):
+    with refusing(CaptureError, f"{group.file.filename}: a group is damaged", errors=DAMAGE):
         return [str(name) for name in group]
 
 
 def attribute(group: h5py.Group, name: str, default: object) -> np.ndarray:
     """Read a group's attribute, or its default, as a flat array; CaptureError if damaged."""
-    with _damage_is_one_error(DAMAGE, f"{group.file.filename}: attribute {name} is damaged"):
+    with refusing(
+        CaptureError, f"{group.file.filename}: attribute {name} is damaged", errors=DAMAGE
+    ):
         return np.ravel(np.asarray(group.attrs.get(name, default)))
 
 
@@ -232,7 +221,7 @@ def read_array(file: h5py.File, name: str) -> np.ndarray:
     node, where = child(file, name), file.filename
     if not isinstance(node, h5py.Dataset):
         raise CaptureError(f"{where}: has no array {name}; copy the file again")
-    with _damage_is_one_error(DAMAGE, f"{where}: {name} is damaged"):
+    with refusing(CaptureError, f"{where}: {name} is damaged", errors=DAMAGE):
         if node.dtype.kind not in "uif" or node.is_virtual or node.external:
             raise CaptureError(
                 f"{where}: {name} is {node.dtype}, expected numbers stored in this file"

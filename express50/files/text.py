@@ -16,9 +16,11 @@ import math
 import os
 import re
 import stat
+import struct
 import tomllib
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeGuard
 from xml.etree import ElementTree
@@ -41,6 +43,12 @@ POINTERS = (
     (b"version https://git-lfs", "Git LFS", "git lfs pull"),
     (b"/annex/objects/", "git-annex", "git annex get FOLDER"),
 )
+
+# What code and libraries raise on values of another type or shape than they expect.
+MALFORMED = (
+    ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError, csv.Error,
+    struct.error,
+)  # fmt: skip
 
 Kind = type[Express50Error]
 
@@ -255,6 +263,22 @@ def read_xml(path: Path, kind: Kind) -> ElementTree.Element:
         return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         raise kind(f"{path}: not XML ({reason(error)}); {AGAIN}") from None
+
+
+@contextmanager
+def refusing(
+    kind: Kind, words: str, fix: str = AGAIN, errors: tuple[type[BaseException], ...] = MALFORMED
+) -> Iterator[None]:
+    """Turn what code raises on a malformed file into one error: what it is not, why, how to fix it.
+
+    Raises:
+        Express50Error: of the given kind: the body raised one of the ``errors``.
+    """
+    try:
+        yield
+    except errors as error:
+        why = f"has no {error}" if isinstance(error, KeyError) else reason(error)
+        raise kind(f"{words} ({why}); {fix}") from error
 
 
 def reason(error: BaseException) -> str:

@@ -22,7 +22,7 @@ from av.video.reformatter import Interpolation
 
 from express50.errors import CaptureError
 from express50.files.images import encode_jpeg, encode_png
-from express50.files.text import check_readable, reason
+from express50.files.text import check_readable, reason, refusing
 from express50.geometry.shapes import PIXEL_LIMIT
 
 # An H.264 or H.265 picture may be displayed up to 16 pictures away from its position in the stream,
@@ -103,12 +103,9 @@ def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
     limits = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
     # On opening, FFmpeg would decode a picture (0.26 core seconds at 4K); the header is enough.
     unseen = {"skip_frame": "all"}
-    try:
+    fix = "copy or encode it again"
+    with refusing(CaptureError, f"{path}: cannot be opened as a video", fix, DAMAGE):
         container = av.open(str(path), container_options=limits, options=unseen)
-    except DAMAGE as error:
-        raise CaptureError(
-            f"{path}: cannot be opened as a video ({reason(error)}); copy or encode it again"
-        ) from error
     if not container.streams.video:
         container.close()
         raise CaptureError(f"{path}: holds no video stream, expected one")
@@ -134,7 +131,7 @@ def _pixels(
         )
     whole = frame.format.name == "yuv444p" and frame.color_range == LIMITED
     weights = LUMA.get(int(frame.colorspace)) if whole else None
-    try:
+    with refusing(CaptureError, f"{path}: a frame cannot be converted", errors=DAMAGE):
         if weights is None:
             return frame.to_ndarray(format="rgb24", interpolation=conversion)
         # FFmpeg takes five to nine times as long for three full planes, as it has no fast path from
@@ -147,8 +144,6 @@ def _pixels(
         matrix = 255 * np.column_stack([np.full(3, 1 / 219), np.divide(chroma, 224)])
         offset = -matrix @ (16, 128, 128)
         return cv2.transform(cv2.merge(planes), np.column_stack([matrix, offset]))
-    except DAMAGE as error:
-        raise CaptureError(f"{path}: a frame cannot be converted ({reason(error)})") from error
 
 
 def _decode(
@@ -164,7 +159,7 @@ def _decode(
     `packets` are those to decode, by default all that follow.
     """
     context = stream.codec_context
-    try:
+    with refusing(CaptureError, f"{path}: decoding failed", errors=DAMAGE):
         for packet in packets or container.demux(stream):
             if unneeded and context.name in LEAVING_OUT:
                 left = packet.pts is not None and unneeded(packet.pts)
@@ -178,10 +173,6 @@ def _decode(
                 if frame.pts is None:
                     raise CaptureError(f"{path}: {UNTIMED}")
                 yield frame
-    except DAMAGE as error:
-        raise CaptureError(
-            f"{path}: decoding failed ({reason(error)}); copy the file again"
-        ) from error
 
 
 def _in_order(path: Path, frames: Iterable[av.VideoFrame]) -> Iterator[av.VideoFrame]:
@@ -242,15 +233,11 @@ def frame_times(path: Path) -> tuple[int, ...]:
     container, stream = _open(path)
     with container:
         stamps, alone = [], True
-        try:
+        with refusing(CaptureError, f"{path}: cannot be read", errors=DAMAGE):
             for packet in container.demux(stream):  # not kept: a clip may have gigabytes
                 if packet.size and not packet.is_discard:
                     stamps.append(packet.pts)
                     alone = alone and packet.is_keyframe
-        except DAMAGE as error:
-            raise CaptureError(
-                f"{path}: cannot be read ({reason(error)}); copy it again"
-            ) from error
         if container.format.name == "avi" and not alone:
             container.seek(0)
             return tuple(f.pts for f in _in_order(path, _decode(path, container, stream)))

@@ -16,7 +16,7 @@ from skimage.measure import points_in_poly
 
 from express50.errors import HeadModelError
 from express50.files.arrays import read_arrays
-from express50.files.text import read_text
+from express50.files.text import read_text, refusing
 from express50.geometry.meshes import check_faces, mesh_parts, open_edges
 from express50.geometry.sampling import smoothstep
 from express50.head.model import PARENTS, HeadModel, check_head
@@ -84,18 +84,16 @@ def load_ict(path: str | Path) -> HeadModel:
         )
     if "jawOpen" not in arrays.expression_names:
         raise HeadModelError(f"{path}: no expression jawOpen, expected for the jaw; copy it again")
-    try:
+    with refusing(HeadModelError, f"{path}: arrays do not fit"):
         _check_mesh(arrays.template, arrays.faces)
         _check_mesh(arrays.uv, arrays.uv_faces)
         return check_head(build_ict_head(arrays))
-    except (ValueError, IndexError) as error:
-        raise HeadModelError(f"{path}: arrays do not fit ({error}); copy it again") from None
 
 
 def read_ict_npz(path: Path) -> IctArrays:
     """Read the arrays from one .npz; pickled objects are refused."""
     data = read_arrays(path, HeadModelError, "an ICT .npz", _NPZ_KEYS)
-    try:
+    with refusing(HeadModelError, f"{path}: not a readable ICT .npz"):
         return IctArrays(
             template=data["v_template"].astype(np.float64),
             shape_dirs=data["shapedirs"].astype(np.float32),
@@ -106,8 +104,6 @@ def read_ict_npz(path: Path) -> IctArrays:
             uv_faces=data["uv_faces"].astype(np.int64),
             face_material=data["materials"].astype(str)[data["face_material"]],
         )
-    except (ValueError, TypeError, IndexError) as error:
-        raise HeadModelError(f"{path}: not a readable ICT .npz ({error}); copy it again") from error
 
 
 def read_ict_checkout(path: Path) -> IctArrays:
@@ -148,7 +144,7 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     uv: list[list[str]] = []
     corners: list[tuple[str, str, str]] = []
     material, materials = "", []
-    try:
+    with refusing(HeadModelError, f"{path}: not an OBJ file"):
         for line in read_text(path, HeadModelError).split("\n"):
             words = line.split()
             if not words:
@@ -172,8 +168,6 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
         coordinates = np.array(uv or [["0", "0"]], dtype=np.float64).reshape(-1, 2)
         _check_mesh(points, faces)
         _check_mesh(coordinates, uv_faces)
-    except (OSError, ValueError, IndexError, OverflowError) as error:
-        raise HeadModelError(f"{path}: not an OBJ file ({error}); copy it again") from error
     return points, coordinates, faces, uv_faces, np.array(materials)
 
 
@@ -233,10 +227,8 @@ def _offsets(files: list[Path], template: np.ndarray) -> np.ndarray:
     columns = []
     for file in files:
         lines = read_text(file, HeadModelError).splitlines()
-        try:
+        with refusing(HeadModelError, f"{file}: not an OBJ file"):
             rows = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], float)
-        except ValueError as error:
-            raise HeadModelError(f"{file}: not an OBJ file ({error}); copy it again") from error
         if rows.shape != template.shape:
             raise HeadModelError(
                 f"{file}: {rows.shape[0]} vertices, expected the neutral's {template.shape[0]};"

@@ -17,7 +17,7 @@ import numpy as np
 from express50.console import log
 from express50.errors import HeadModelError
 from express50.files.arrays import read_arrays
-from express50.files.text import expanded, open_file
+from express50.files.text import expanded, open_file, refusing
 from express50.head import BUILTIN_NAME, HEADS, head_path
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def load_stored(path: Path, name: str) -> HeadModel:
 
     arrays = read_arrays(path, HeadModelError, "a stored head model", FIELDS)
     fields: dict[str, Any] = {}
-    try:
+    with refusing(HeadModelError, f"{path}: not a stored head model", "see docs/RECIPES.md"):
         for key in FIELDS:
             kind = np.float32 if arrays[key].dtype.kind == "f" else np.int64
             if key.endswith("_names"):
@@ -142,10 +142,6 @@ def load_stored(path: Path, name: str) -> HeadModel:
         if "unit_expressions" in arrays:
             fields["unit_expressions"] = bool(arrays["unit_expressions"])
         return check_head(HeadModel(name=name, **fields))
-    except (ValueError, TypeError, RuntimeError) as error:
-        raise HeadModelError(
-            f"{path}: not a stored head model ({error}); see docs/RECIPES.md"
-        ) from error
 
 
 def _region_masks(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -28,7 +28,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from express50.errors import FormatError
 from express50.files.arrays import read_arrays
-from express50.files.text import AGAIN, reason
+from express50.files.text import refusing
 from express50.geometry.conventions import cell_centres, corner_to_cell
 from express50.landmarks import WEIGHTS
 
@@ -303,11 +303,9 @@ def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
     arrays = read_arrays(path, FormatError, "landmark weights", names)
     net = LandmarkNet("outline.spread" in arrays)
     names = [key for key in net.state_dict() if not key.endswith(COUNTERS)]
-    try:
+    with refusing(FormatError, f"{path}: not landmark weights"):
         state = {key: torch.from_numpy(arrays[key].astype(np.float32)) for key in names}
         net.load_state_dict(state, strict=False)
-    except (KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise FormatError(f"{path}: not landmark weights ({reason(error)}); {AGAIN}") from None
     return net.to(memory_format=torch.channels_last)
 
 

@@ -19,7 +19,7 @@ import torch
 
 from express50.errors import ConfigError, FormatError
 from express50.files.arrays import DAMAGE, read_arrays
-from express50.files.text import no_file, read_json
+from express50.files.text import no_file, read_json, refusing
 from express50.geometry.cameras import Camera, normalised
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.transforms import scale_of, transform_points
@@ -178,7 +178,8 @@ def read_points(
 
 
 def _read_raw(path: Path) -> Table:
-    try:
+    fix = "expected the layout of docs/FORMAT.md"
+    with refusing(FormatError, f"{path}: not a file of landmarks", fix):
         if path.suffix.lower() == ".npz":
             return _read_npz(path)
         content = read_json(path, FormatError)
@@ -190,11 +191,6 @@ def _read_raw(path: Path) -> Table:
                 rows = [[np.nan, np.nan, 0.0] if p is None else [*p, 1.0][:3] for p in points]
                 table[camera_id, int(frame)] = np.array(rows, dtype=np.float64)
         return table
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise FormatError(
-            f"{path}: not a file of landmarks ({type(error).__name__}: {error}); expected the"
-            " layout of docs/FORMAT.md"
-        ) from error
 
 
 def _read_npz(path: Path) -> Table:

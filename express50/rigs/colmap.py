@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.files.text import read_bytes, read_text, reason
+from express50.files.text import read_bytes, read_text, refusing
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import make_transform, quat_to_matrix
 from express50.rigs.camera_builder import as_rig, names_from_files
@@ -56,13 +56,9 @@ def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
         CalibrationError: the model cannot be read, or has an unsupported camera model.
     """
     binary = (path / "images.bin").is_file()
-    try:
+    fix = "expected cameras and images as .bin or .txt: export it again"
+    with refusing(CalibrationError, f"{path}: not a COLMAP model", fix):
         lenses, shots = _read_binary(path) if binary else _read_text(path)
-    except (ValueError, IndexError, struct.error, UnicodeDecodeError) as error:
-        raise CalibrationError(
-            f"{path}: not a COLMAP model ({reason(error)}); expected cameras and images as .bin or"
-            " .txt: export it again"
-        ) from None
     shots = sorted(shots)
     names = names_from_files([shot.name for shot in shots])
     if len(set(names)) < len(names):

@@ -14,7 +14,7 @@ import numpy as np
 
 from express50.errors import CalibrationError, advised
 from express50.files.calibration import read_cameras
-from express50.files.text import identifier, read_json, read_yaml, reason
+from express50.files.text import identifier, read_json, read_yaml, refusing
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
@@ -221,12 +221,8 @@ def _matrix(table: dict, keys: tuple[str, ...], path: Path | str) -> np.ndarray:
     """Read the first matrix found, as rows of numbers or in OpenCV's form; empty if none is."""
     name = next((key for key in keys if key in table), "")
     value = table.get(name, [])
-    try:
+    with refusing(CalibrationError, f"{path}: {name} cannot be read as a matrix"):
         if isinstance(value, dict):
             numbers = np.array(value["data"], np.float64)
             return numbers.reshape(int(value["rows"]), int(value["cols"]))
         return np.array(value, np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise CalibrationError(
-            f"{path}: {name} cannot be read as a matrix ({reason(error)}); write the file again"
-        ) from None

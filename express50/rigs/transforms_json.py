@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.files.text import read_json_table
+from express50.files.text import read_json_table, refusing
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cam_from_world_from_opengl
 from express50.rigs.camera_builder import as_rig, camera_from_K, holds, names_from_files
@@ -44,10 +44,8 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
     tables = isinstance(frames, list) and all(isinstance(frame, dict) for frame in frames)
     if not frames or not tables:
         raise CalibrationError(f"{path}: has no frames; expected [{{transform_matrix, ...}}, ...]")
-    try:
+    with refusing(CalibrationError, f"{path}: camera_index is not a number"):
         names = camera_names(frames)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise CalibrationError(f"{path}: camera_index is not a number ({error})") from None
     found: dict[str, Camera] = {}
     files: dict[str, str] = {}
     for number, (name, frame) in enumerate(zip(names, frames, strict=True)):
@@ -57,10 +55,8 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
                 f"{path}: {files[name]} and {file} are both camera {name}; rename one"
             )
         where = f"{path}: frame {number} ({name})"
-        try:
+        with refusing(CalibrationError, f"{where}: a value has the wrong type"):
             camera = frame_camera(where, name, table | frame, size)
-        except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
-            raise CalibrationError(f"{where}: a value has the wrong type ({error})") from None
         earlier = found.setdefault(name, camera)
         if np.abs(earlier.cam_from_world - camera.cam_from_world).max() > 1e-6:
             raise CalibrationError(

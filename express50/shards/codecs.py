@@ -14,6 +14,7 @@ import numpy as np
 
 from express50.errors import FormatError
 from express50.files.images import decode_image, encode_jpeg, encode_png, image_size
+from express50.files.text import refusing
 from express50.geometry.shapes import PIXEL_LIMIT
 
 AGAIN = "rerun 'express50 pack'"
@@ -74,7 +75,7 @@ def decode_picture(name: str, data: bytes, width: int, height: int, where: str) 
         raise FormatError(
             f"{where}: {size[0]}x{size[1]} pixels, expected the meta's {width}x{height}; {AGAIN}"
         )
-    try:
+    with refusing(FormatError, f"{where}: cannot be decoded", AGAIN):
         if name.endswith(".zst"):
             bytes_out = bytearray(width * height + 1)  # one more, to notice contents too long
             count = len(imagecodecs.zstd_decode(data, out=bytes_out))
@@ -84,8 +85,6 @@ def decode_picture(name: str, data: bytes, width: int, height: int, where: str) 
         else:
             lerc = name.endswith(".lerc")
             image = (imagecodecs.lerc_decode if lerc else imagecodecs.jpeg8_decode)(data)
-    except (RuntimeError, ValueError) as error:  # imagecodecs' errors are RuntimeErrors
-        raise FormatError(f"{where}: cannot be decoded ({error}); {AGAIN}") from None
     shape = (height, width, 3) if name in RGB else (height, width)
     kind = np.dtype(np.uint16 if name in DEPTH else np.uint8)
     if image.dtype != kind or image.shape != shape:

@@ -32,7 +32,7 @@ from express50.contract.segmentation_labels import COLOURS
 from express50.errors import FormatError, check_known
 from express50.files.arrays import read_arrays, read_npy
 from express50.files.images import contact_sheet
-from express50.files.text import KEY_LENGTH, no_folder, parse_json, read_json
+from express50.files.text import KEY_LENGTH, no_folder, parse_json, read_json, refusing
 from express50.geometry.shapes import check_finite, check_shape
 from express50.shards.codecs import AGAIN, ALPHA, DEPTH, PARTS, RGB, crc32, decode_picture
 
@@ -228,7 +228,7 @@ class ShardReader:
         wanted = ("expressions", "offsets", "sigma")
         arrays = read_arrays(path, FormatError, "registered meshes", wanted, _COPY_AGAIN)
         names, offsets, sigma = (arrays[name] for name in wanted)
-        try:
+        with refusing(FormatError, f"{path}: not registered meshes", _COPY_AGAIN):
             check_shape("expressions", names, (None,))
             check_shape("offsets", offsets, (len(names), None, 3))
             check_shape("sigma", sigma, offsets.shape[:2])
@@ -236,8 +236,6 @@ class ShardReader:
                 if array.dtype.kind != "f":
                     raise ValueError(f"{name} is {array.dtype}, expected numbers")
                 check_finite(name, array)
-        except ValueError as error:
-            raise FormatError(f"{path}: {error}; {_COPY_AGAIN}") from None
         pairs = zip(offsets.astype(np.float32), sigma.astype(np.float32), strict=True)
         return dict(zip(names.tolist(), pairs, strict=True))
 
@@ -278,11 +276,9 @@ def read_entries(root: Path) -> tuple[Entry, ...]:
         got = table.get("schema") if isinstance(table, dict) else type(table).__name__
         raise FormatError(f"{path}: schema {got!r}, expected {SCHEMA!r}; {AGAIN}")
     entries: list[Entry] = []
-    try:
+    with refusing(FormatError, f"{path}: malformed", AGAIN):
         for shard in table["shards"]:
             entries += _shard_entries(root, shard)
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise FormatError(f"{path}: malformed ({type(error).__name__}: {error}); {AGAIN}") from None
     if len({entry.key for entry in entries}) != len(entries):
         raise FormatError(f"{path}: a key appears twice; {AGAIN}")
     return tuple(entries)

@@ -19,7 +19,7 @@ from express50.console import count, log
 from express50.errors import FormatError
 from express50.files.atomic import folder_in_one_step, link_file, write_json
 from express50.files.digests import file_sha256
-from express50.files.text import KEY_LENGTH, NAME, no_folder, read_json
+from express50.files.text import KEY_LENGTH, NAME, no_folder, read_json, refusing
 from express50.shards.codecs import AGAIN, crc32
 from express50.shards.reader import (
     KEY,
@@ -291,10 +291,8 @@ def _manifest_digests(root: Path) -> dict[str, str]:
             f"or {AGAIN}"
         )
     files = read_json(path, FormatError)
-    try:
+    with refusing(FormatError, f"{path}: malformed", AGAIN):
         return {name: str(row["sha256"]) for name, row in files["files"].items()}
-    except (KeyError, TypeError, AttributeError) as error:
-        raise FormatError(f"{path}: malformed ({error}); {AGAIN}") from None
 
 
 def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> int:

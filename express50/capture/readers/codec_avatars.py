@@ -25,7 +25,14 @@ from express50.capture.readers.selection import Moment, Selection, check_selecti
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import finite_array
 from express50.files.containers import WITHIN, open_zip
-from express50.files.text import NAME, check_readable, identifier, read_json_table, read_text
+from express50.files.text import (
+    NAME,
+    check_readable,
+    identifier,
+    read_json_table,
+    read_text,
+    refusing,
+)
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.rigs.camera_builder import as_rig, camera_from_K, in_metres
@@ -65,14 +72,10 @@ def read_ava256(path: Path, selection: Selection) -> RawCapture:
         CalibrationError: the cameras are malformed.
     """
     file = path / "decoder/frame_list.csv"
-    try:
+    columns = "expected columns seg_id and frame_id"
+    with refusing(CaptureError, f"{file}: not a list of frames", columns):
         table = csv.DictReader(read_text(file, CaptureError).splitlines())
         listed = [(row["seg_id"].strip(), int(row["frame_id"][:9])) for row in table]
-    except (AttributeError, KeyError, TypeError, ValueError, csv.Error) as error:
-        raise CaptureError(
-            f"{file}: not a list of frames ({type(error).__name__}: {error}); expected columns "
-            "seg_id and frame_id"
-        ) from error
     cameras = _ava256_cameras(path / AVA256_CAMERAS)
     return _read(path, "AVA-256", cameras, listed, _ava256_pictures, selection)
 
