@@ -26,9 +26,9 @@ from express50.capture.raw import (
 from express50.capture.readers import codec_avatars, folders, pictures, renderme, videos
 from express50.capture.readers.selection import Selection, folder_id, parse_selection
 from express50.contract.layout import Dataset, footage_source
-from express50.errors import CalibrationError, CaptureError, Express50Error, check_known, few
+from express50.errors import CaptureError, Express50Error, check_known, few
 from express50.files.text import check_readable
-from express50.rigs.world_frame import judge
+from express50.rigs.world_frame import check_meeting, judge
 
 OURS = "express50"
 
@@ -40,8 +40,8 @@ class Layout:
     name: str
     looks: str  # what it looks like in words, for errors
     fits: Callable[[Path], bool]  # whether a file or folder is one
-    subject_of: Callable[[Path], str]  # the subject's id
     read: Callable[[Path, Selection], RawCapture]  # the selected parts of the capture
+    subject_of: Callable[[Path], str] = folder_id  # the subject's id
     named: bool = False  # whether it needs no test where capture.toml names it
 
 
@@ -49,52 +49,48 @@ class Layout:
 LAYOUTS = (
     Layout(
         "renderme360", "<actor>_<performance>_raw.smc",
-        renderme.fits, renderme.subject_of, renderme.read,
+        renderme.fits, renderme.read, renderme.subject_of,
     ),
     Layout(
         "nersemble", "calibration/camera_params.json and sequences/",
-        videos.fits_nersemble, folder_id, videos.read_participant,
+        videos.fits_nersemble, videos.read_participant,
     ),
     Layout(
         "ava256", "decoder/camera_calibration.json",
-        codec_avatars.fits_ava256, codec_avatars.subject_of, codec_avatars.read_ava256,
+        codec_avatars.fits_ava256, codec_avatars.read_ava256, codec_avatars.subject_of,
     ),
     Layout(
         "multiface", "KRT and images/",
-        codec_avatars.fits_multiface, codec_avatars.subject_of, codec_avatars.read_multiface,
+        codec_avatars.fits_multiface, codec_avatars.read_multiface, codec_avatars.subject_of,
     ),
     Layout(
         "ravdess", "01-01-03-02-01-01-05.mp4",
-        videos.fits_ravdess, videos.actor_of, videos.read_actor,
+        videos.fits_ravdess, videos.read_actor, videos.actor_of,
     ),
     Layout(
         "transforms", "transforms.json",
-        pictures.fits_transforms, folder_id, pictures.read_transforms_folder,
+        pictures.fits_transforms, pictures.read_transforms_folder,
     ),
+    Layout("colmap", "images/ and sparse/0/", pictures.fits_colmap, pictures.read_colmap_folder),
     Layout(
-        "colmap", "images/ and sparse/0/",
-        pictures.fits_colmap, folder_id, pictures.read_colmap_folder,
-    ),
-    Layout(
-        "photos", "a folder of images, or images/ in it",
-        pictures.fits_photos, folder_id, pictures.read_photos,
+        "photos", "a folder of images, or images/ in it", pictures.fits_photos, pictures.read_photos
     ),
     Layout(
         "videos", f"a folder of videos ({' '.join(VIDEO_SUFFIXES)}), one per camera",
-        folders.fits_videos, folder_id, folders.read_videos,
+        folders.fits_videos, folders.read_videos,
     ),
-    Layout("video", "a video file", videos.fits_video, videos.video_id, videos.read_video),
+    Layout("video", "a video file", videos.fits_video, videos.read_video, videos.video_id),
     Layout(
         "camera_folders", "a folder per camera, such as cam_01/, of videos, pictures or folders",
-        folders.fits_camera_folders, folder_id, folders.read_camera_folders, named=True,
+        folders.fits_camera_folders, folders.read_camera_folders, named=True,
     ),
     Layout(
         "expression_folders", "a folder per expression, of cam_01.mp4, cam_01.png or cam_01/ ...",
-        folders.fits_expression_folders, folder_id, folders.read_expression_folders, named=True,
+        folders.fits_expression_folders, folders.read_expression_folders, named=True,
     ),
     Layout(
         "frame_folders", "a folder per frame, of pictures such as cam_01.png",
-        folders.fits_frame_folders, folder_id, folders.read_frame_folders, named=True,
+        folders.fits_frame_folders, folders.read_frame_folders, named=True,
     ),
 )  # fmt: skip
 
@@ -225,12 +221,9 @@ def read_any(path: Path) -> RawCapture:
     calibration = {k: c for k, c in (raw.calibration or {}).items() if k in raw.cameras}
     warnings = dict(raw.warnings)
     if calibration:
-        verdict = judge(calibration)
-        if verdict.problem:
-            remedy = verdict.remedy or "check the calibration"
-            raise CalibrationError(f"{path}: {verdict.problem}; {remedy}")
-        if verdict.warnings:
-            warnings["cameras"] = "; ".join(verdict.warnings)
+        check_meeting(calibration, str(path))
+        if odd := judge(calibration).warnings:
+            warnings["cameras"] = "; ".join(odd)
     return replace(
         raw,
         subject=subject,
