@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from express50.geometry.sampling import smoothstep
-from express50.head.generator.eyes import lid_motion, turned
+from express50.head.generator.features import lid_motion, turned
 from express50.head.generator.field import window
 from express50.head.generator.mesh import WholeMesh
 

@@ -162,6 +162,12 @@ def cast(origins: Array, directions: Array) -> Array:
     return origins + t[:, None] * d
 
 
+def from_front(xy: Array) -> Array:
+    """Return the skin points (N,3) at front-view positions (N,2)."""
+    origins = np.concatenate([xy, np.zeros((len(xy), 1))], 1)
+    return cast(origins, np.tile([0.0, 0.0, 1.0], (len(xy), 1)))
+
+
 def cast_out(origins: Array, directions: Array) -> Array:
     """Find where (N,3) rays that start inside the skin first leave it."""
     d = unit(directions)

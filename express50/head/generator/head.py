@@ -21,10 +21,9 @@ import numpy as np
 
 from express50.geometry.sampling import smoothstep
 from express50.head.generator.expressions import expression_directions
-from express50.head.generator.eyes import add_eyeball, ball_centre
+from express50.head.generator.features import add_eyeball, add_teeth, add_tongue, ball_centre
 from express50.head.generator.field import window
 from express50.head.generator.mesh import HalfMesh, WholeMesh, mirrored, neighbour_mean, pack_uv
-from express50.head.generator.mouth import add_teeth, add_tongue
 from express50.head.generator.people import People, fit_people
 from express50.head.generator.regions import contour_candidates, embed_landmarks, region_masks
 from express50.head.generator.skin import add_skin, set_skin_uv

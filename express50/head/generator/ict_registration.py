@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 
 from express50.geometry.meshes import cotangent_laplacian, edge_graph, open_edges
 from express50.geometry.transforms import unit
-from express50.head.generator.eyes import LID_SEGMENTS
-from express50.head.generator.mesh import WholeMesh
+from express50.head.generator.features import LID_SEGMENTS
+from express50.head.generator.mesh import WholeMesh, is_skin
 from express50.head.generator.regions import embed_landmarks
 from express50.head.ict import LANDMARKS, RANGES, IctArrays
 from express50.head.model import normals_of
@@ -103,7 +103,7 @@ def rim_targets(mesh: WholeMesh, skin: IctSkin) -> RimTargets:
 
 
 def _lid_margin(skin: IctSkin) -> Array:
-    """Return the left lid margin (40, 3): upper lid outwards, lower lid back, as in `eyes`."""
+    """Return the left lid margin (40, 3): upper lid outwards, lower lid back, as in `features`."""
     marks = skin.marks
     inner, outer = marks[42], marks[45]
     ring = skin.ring(marks[42:48], (MARGIN_RING,))
@@ -189,11 +189,6 @@ def _outer_points(points: Array, chin: float) -> Array:
     level = np.where((np.abs(y - chin + 40) < 7) & (np.abs(z + 15) < 12), 1.0, np.nan)
     beside = points[np.nanargmax(x * level)]
     return np.array([found[0] * FLAT, found[1] * FLAT, *found[2:], beside, beside * FLIP])
-
-
-def is_skin(mesh: WholeMesh) -> Array:
-    """Mark the triangles (F,) bool of the skin and the ears."""
-    return np.isin(mesh.face_chart, ("skin", "ear", "ear_right"))
 
 
 def hidden_vertices(mesh: WholeMesh) -> Array:

@@ -89,6 +89,11 @@ class WholeMesh:
         return right if side == "right" else np.unique(np.concatenate([left, right]))
 
 
+def is_skin(mesh: WholeMesh) -> Array:
+    """Mark the triangles (F,) bool of the skin and the ears."""
+    return np.isin(mesh.face_chart, ("skin", "ear", "ear_right"))
+
+
 def mirrored(half: HalfMesh) -> WholeMesh:
     """Mirror the half and weld it at x = 0."""
     points = half.points

@@ -30,12 +30,11 @@ from express50.head.generator.ict_registration import (
     IctSkin,
     hidden_vertices,
     ict_skin,
-    is_skin,
     register_skin,
     sample_skin,
     warp_between,
 )
-from express50.head.generator.mesh import WholeMesh
+from express50.head.generator.mesh import WholeMesh, is_skin
 from express50.head.ict import RANGES, IctArrays, read_ict_npz
 from express50.head.model import normals_of
 

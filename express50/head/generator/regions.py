@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from express50.head.generator.eyes import from_front
-from express50.head.generator.field import cast, labels, project, rays
-from express50.head.generator.mesh import WholeMesh
+from express50.head.generator.field import cast, from_front, labels, project, rays
+from express50.head.generator.mesh import WholeMesh, is_skin
 
 Array = np.ndarray
 
@@ -22,7 +21,7 @@ def region_masks(mesh: WholeMesh) -> dict[str, Array]:
     """Return masks (V,) bool by region name."""
     x, y, z = np.abs(mesh.vertices[:, 0]), mesh.vertices[:, 1], mesh.vertices[:, 2]
     skin = np.zeros(len(x), bool)  # ears included, without the mouth's cavity
-    skin[mesh.faces[np.isin(mesh.face_chart, ("skin", "ear", "ear_right"))]] = True
+    skin[mesh.faces[is_skin(mesh)]] = True
     regions = {
         "lips": _mask(mesh, [f"lip{k}" for k in range(4)]),
         "upper_teeth": _mask(mesh, ["upper_teeth"]),

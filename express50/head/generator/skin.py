@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, cKDTree
 from skimage.measure import points_in_poly
 
 from express50.geometry.transforms import unit
-from express50.head.generator.eyes import add_eye_rings
+from express50.head.generator.features import add_eye_rings, add_lip_rings
 from express50.head.generator.field import (
     BOTTOM_LATITUDE,
     cast,
@@ -25,7 +25,6 @@ from express50.head.generator.field import (
     window,
 )
 from express50.head.generator.mesh import HalfMesh, neighbour_mean
-from express50.head.generator.mouth import add_lip_rings
 
 Array = np.ndarray
 
