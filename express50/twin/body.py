@@ -10,10 +10,16 @@ import torch
 from express50.geometry.sampling import smoothstep
 from express50.geometry.transforms import rigid_fit, transform_points
 from express50.head.model import HeadModel, landmarks, pose
-from express50.twin.alive import own_offsets
-from express50.twin.hair import HairMesh, grow_hair, join_hair
+from express50.twin.hair import HairMesh, grow_hair
 from express50.twin.subjects import TwinPerformance, TwinSubject
-from express50.twin.surface import Caster, Material, StarMap, smooth_over_mesh, vertex_normals
+from express50.twin.surface import (
+    Caster,
+    Material,
+    StarMap,
+    joined_arrays,
+    smooth_over_mesh,
+    vertex_normals,
+)
 from express50.twin.worn import WITH_HAND, WornMesh, grow_worn, hold, wear
 
 
@@ -78,9 +84,8 @@ def build_body(
     hair = grow_hair(rng, rest, faces, scalp, star, subject.look, hair_detail)
     # Worn hair has its own random numbers, so that it does not change the rest of the person.
     seeds = [seed, subject.number, 13]
-    hair = join_hair(
-        [hair, *grow_worn(kinds, model, rest, scalp, star, subject.look, hair_detail or 1.0, seeds)]
-    )
+    grown = grow_worn(kinds, model, rest, scalp, star, subject.look, hair_detail or 1.0, seeds)
+    hair = HairMesh(**joined_arrays([hair, *grown]))
     worn = wear(kinds, model, rest, skin_faces, subject.look, np.random.default_rng(seeds))
     skull = np.flatnonzero(scalp > 0.8)[::7]
     extras = Extras(
@@ -185,6 +190,12 @@ def head_vertices(
             offsets=row(offsets),
         )
     return posed[0].double().numpy() @ play.R[frame].T + play.t[frame]
+
+
+def own_offsets(model: HeadModel, own: np.ndarray, expression: np.ndarray) -> np.ndarray:
+    """Return the rest offsets (V, 3) that own motion (V, 3, 3) adds to an expression (X,)."""
+    moved = model.expression_dirs.double().numpy() @ expression
+    return np.einsum("vij,vj->vi", own, moved)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -58,15 +58,6 @@ class HairMesh:
     moves: np.ndarray  # (N,) the head vertex that each vertex moves with, or -1 for the skull
 
 
-def join_hair(meshes: list[HairMesh]) -> HairMesh:
-    """Join meshes of ribbons into one."""
-    names = ("vertices", "tangents", "normals", "colours", "moves")
-    counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    faces = [mesh.faces + count for mesh, count in zip(meshes, counts, strict=True)]
-    parts = {name: np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in names}
-    return HairMesh(faces=np.concatenate(faces).astype(np.int32), **parts)
-
-
 def grow_hair(
     rng: np.random.Generator,
     vertices: np.ndarray,

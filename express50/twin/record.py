@@ -229,7 +229,7 @@ def _film(config: TwinConfig, task: Task, staging: Path) -> None:
 
 def _publish(config: TwinConfig, subject: str, staging: Path, out: Path) -> None:
     """Add a subject's other files to its footage, then move truth and capture into place."""
-    from express50.twin.board import BOARD_TOML
+    from express50.twin.rig import BOARD_TOML
 
     capture, truth = staging / "captures" / subject, staging / "truth" / subject
     about = json.loads((truth / "subject.json").read_text())

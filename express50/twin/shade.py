@@ -12,9 +12,8 @@ import numpy as np
 
 from express50.geometry.sampling import smoothstep
 from express50.head.model import HeadModel
-from express50.twin.alive import LivingSkin
 from express50.twin.body import Body, Posed, model_materials
-from express50.twin.skin import SkinTexture, sample_skin
+from express50.twin.skin import LivingSkin, SkinTexture, sample_skin
 from express50.twin.surface import (
     MISS,
     Caster,
@@ -291,12 +290,13 @@ def _surface(
         return texel[:, :3], 0.045 * texel[:, 3:], 22.0
     if kind == Material.EYE:
         return _eye_albedo(scene, place), 0.16, 240.0
-    if kind == Material.CLOTH:
-        return place, 0.01, 5.0
-    if kind == Material.HAND:
-        return place, 0.045, 22.0
-    if kind == Material.APPAREL:
-        return place, 0.12, 60.0
+    plain = {
+        Material.CLOTH: (0.01, 5.0),
+        Material.HAND: (0.045, 22.0),
+        Material.APPAREL: (0.12, 60.0),
+    }
+    if kind in plain:
+        return place, *plain[Material(kind)]
     colour, gloss, power = {
         Material.TEETH: ((0.66, 0.57, 0.44), 0.2, 90.0),
         Material.MOUTH: ((0.30, 0.10, 0.09), 0.10, 40.0),

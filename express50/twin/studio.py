@@ -22,13 +22,19 @@ from express50.geometry.cameras import Camera
 from express50.head import absolute_head
 from express50.head.load import load_head
 from express50.twin import TwinConfig
-from express50.twin.alive import living_skin
-from express50.twin.board import board_poses, render_board, studio_bands
 from express50.twin.body import Body, build_body, pose_body, with_hand
 from express50.twin.render import RowBand, Sampling, hull_of, render_band, window_of
-from express50.twin.rig import Sensor, expose, make_rig, make_sensor
+from express50.twin.rig import (
+    Sensor,
+    board_poses,
+    expose,
+    make_rig,
+    make_sensor,
+    render_board,
+    studio_bands,
+)
 from express50.twin.shade import LitScene, build_scene, find_eyes, make_lighting, shade
-from express50.twin.skin import paint_skin, texture_width
+from express50.twin.skin import living_skin, paint_skin, texture_width
 from express50.twin.subjects import TwinPerformance, make_subject, perform
 
 # Up to this many pixels, rays and plates are kept between frames (about 50 bytes per pixel);

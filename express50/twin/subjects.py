@@ -16,11 +16,13 @@ from express50.errors import HeadModelError
 from express50.geometry.sampling import smoothstep
 from express50.geometry.transforms import axis_angle_to_matrix, matrix_to_axis_angle
 from express50.head.model import HeadModel, in_regions
-from express50.twin.alive import own_motion
 from express50.twin.rig import TARGET
 from express50.twin.surface import fractal, make_lattice
 
 OFFSET_RMS_M = 1.2e-3
+# Standard deviation of an entry of `own_motion` if `twin.personal` is 1: the person adds two fifths
+# of a motion; wavelength of the entries over the skin, metres.
+OWN_SHARE, WAVE_M = 0.25, 0.045
 # Linear-light albedo of skin from light to deep (sRGB about 233 196 176 ... 92 62 49).
 _SKIN_TONES = np.array([
     [0.74, 0.50, 0.39], [0.64, 0.40, 0.28], [0.52, 0.30, 0.20], [0.38, 0.20, 0.12],
@@ -69,7 +71,7 @@ class TwinSubject:
     shape: np.ndarray  # (S,) coefficients
     offsets: np.ndarray  # (V, 3) metres, added at rest, orthogonal to the model's shape space
     look: PersonLook
-    own: np.ndarray | None = None  # (V, 3, 3) from `alive.own_motion`
+    own: np.ndarray | None = None  # (V, 3, 3) from `own_motion`
 
 
 def make_subject(
@@ -102,6 +104,21 @@ def make_subject(
     return TwinSubject(
         id=subject_id, number=number, shape=shape, offsets=offsets, look=look, own=own
     )
+
+
+def own_motion(model: HeadModel, number: int, seed: int, amount: float) -> np.ndarray:
+    """Draw the matrices (V, 3, 3) that map the model's motion to what a person adds to it.
+
+    They are linear in the coefficients, but outside the model's space.
+    """
+    template = model.template.double().numpy()
+    rng = np.random.default_rng([seed, number, 15])
+    field = np.empty((len(template), 3, 3))
+    for row in range(3):
+        for column in range(3):
+            field[:, row, column] = fractal(template, make_lattice(rng), WAVE_M, 2)
+    spread = float(np.sqrt((field**2).mean()))
+    return (field * (OWN_SHARE * amount / max(spread, 1e-9))).astype(np.float32)
 
 
 def soft_mask(model: HeadModel) -> np.ndarray:

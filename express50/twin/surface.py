@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -74,6 +76,16 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     # A product with it sums values of faces at their vertices.
     incidence = scipy.sparse.csr_matrix((ones, where), shape=(len(vertices), len(faces)))
     return unit(incidence @ np.cross(b - a, c - a))
+
+
+def joined_arrays(meshes: Sequence[Any]) -> dict[str, np.ndarray]:
+    """Join the arrays of meshes, by name; faces then count all vertices."""
+    counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + count for mesh, count in zip(meshes, counts, strict=True)]
+    arrays = {
+        name: np.concatenate([vars(mesh)[name] for mesh in meshes]) for name in vars(meshes[0])
+    }
+    return arrays | {"faces": np.concatenate(faces).astype(np.int32)}
 
 
 def smooth_over_mesh(values: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:

@@ -21,7 +21,15 @@ from express50.head.model import HeadModel, landmarks
 from express50.landmarks.training.scene import RING, glasses_lines
 from express50.twin.hair import HairMesh, grow_hair
 from express50.twin.subjects import PersonLook
-from express50.twin.surface import Caster, Material, StarMap, make_lattice, noise, vertex_normals
+from express50.twin.surface import (
+    Caster,
+    Material,
+    StarMap,
+    joined_arrays,
+    make_lattice,
+    noise,
+    vertex_normals,
+)
 
 HAIRY = ("beard", "moustache", "fringe")
 WITH_SKULL, WITH_HAND = -1, -2
@@ -67,17 +75,6 @@ def bare() -> WornMesh:
                     colours=none, moves=few)  # fmt: skip
 
 
-def joined(meshes: list[WornMesh]) -> WornMesh:
-    """Join meshes into one, lenses last."""
-    counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = [mesh.faces + count for mesh, count in zip(meshes, counts, strict=False)]
-    names = ("vertices", "material", "colours", "moves")
-    parts = {name: np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in names}
-    order = np.argsort(parts["material"] == Material.LENS, kind="stable")
-    parts["material"] = parts["material"][order]
-    return WornMesh(faces=np.concatenate(faces)[order].astype(np.int32), **parts)
-
-
 def wear(
     kinds: tuple[str, ...], model: HeadModel, rest: np.ndarray, skin_faces: np.ndarray,
     look: PersonLook, rng: np.random.Generator,
@@ -99,7 +96,9 @@ def wear(
         found.append(_mask(marks, rest, skin_faces, shade + 0.3))
     if "hand" in kinds:
         found.append(_hand(look.skin, rng))
-    return joined(found)
+    parts = joined_arrays(found)
+    order = np.argsort(parts["material"] == Material.LENS, kind="stable")
+    return WornMesh(**parts | {name: parts[name][order] for name in ("faces", "material")})
 
 
 def grow_worn(

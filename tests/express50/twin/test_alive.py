@@ -9,8 +9,8 @@ from benchmarks.truth import Truth
 from express50.capture.expressions import select
 from express50.head.load import load_head
 from express50.head.model import landmarks_of
-from express50.twin.alive import living_skin, own_offsets
-from express50.twin.body import build_body, head_vertices
+from express50.twin.body import build_body, head_vertices, own_offsets
+from express50.twin.skin import living_skin
 from express50.twin.studio import write_truth
 from express50.twin.subjects import make_subject, perform
 

@@ -4,9 +4,16 @@ import pytest
 
 from express50.geometry.cameras import project
 from express50.geometry.conventions import opencv_pixels_to_corner
-from express50.twin.board import _RAYS, board_poses, charuco_board, render_board
 from express50.twin.render import ray_pattern
-from express50.twin.rig import expose, make_rig, make_sensor
+from express50.twin.rig import (
+    _RAYS,
+    board_poses,
+    charuco_board,
+    expose,
+    make_rig,
+    make_sensor,
+    render_board,
+)
 
 
 def facing(cameras, pose):
