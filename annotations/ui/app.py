@@ -25,8 +25,9 @@ from annotations.ui import task as moves
 from annotations.ui import theme, words
 from annotations.ui.frames import ZOOMS, FaceFinder, FrameCache, FrameCrop
 from annotations.ui.images import Painter, PaneShape, SixelPainter
-from annotations.ui.picture import (
+from annotations.ui.panes import (
     Aim,
+    CurveStrip,
     PicturePane,
     camera_name,
     other_cameras,
@@ -38,7 +39,6 @@ from annotations.ui.picture import (
 )
 from annotations.ui.session import Session
 from annotations.ui.task import CueView, TaskScene, load_scene, view_of_scene
-from annotations.ui.timeline import CurveStrip
 from annotations.worklist import LabelTask
 from express50.errors import Express50Error
 

@@ -112,15 +112,12 @@ class FrameCache:
         try:
             picture = read_shot(self._dataset, shot)
         except (Express50Error, OSError, IndexError, ValueError, cv2.error) as error:
-            where = f"{shot.subject} {shot.camera} frame {shot.frame}"
-            if isinstance(error, FileNotFoundError) or isinstance(
-                error.__cause__, FileNotFoundError
-            ):
+            why = f"cannot be read: {error}"
+            if isinstance(error.__cause__ or error, FileNotFoundError):
                 ingest = advised("express50 ingest", self._dataset.root)
-                words = f"{where}: its proxies are missing; run {ingest} again"
-            else:
-                words = f"{where} cannot be read: {error}"
-            raise AnnotationError(words) from error
+                why = f"its proxies are missing; run {ingest} again"
+            where = f"{shot.subject} {shot.camera} frame {shot.frame}"
+            raise AnnotationError(f"{where}: {why}") from error
         picture.setflags(write=False)
         with self._wake:
             if shot not in self._pictures and picture.nbytes <= LIMIT_BYTES:

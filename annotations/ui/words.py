@@ -17,7 +17,7 @@ from textual.widgets import Input, Static
 
 from annotations.labels import FLAG_REASONS, Label, overruling
 from annotations.ui import theme
-from annotations.ui.picture import FrameLook
+from annotations.ui.panes import FrameLook
 from annotations.ui.session import Session
 from annotations.ui.task import CueView, TaskScene
 from annotations.ui.theme import GROUPS, HINTS

@@ -17,10 +17,16 @@ from annotations.sheet import make_sheet, render_sheet
 from annotations.suggestions import Suggested, read_suggestions
 from annotations.ui import task as moves
 from annotations.ui.app import AnnotateApp
-from annotations.ui.picture import frames_ahead
+from annotations.ui.panes import (
+    GUTTER,
+    StripContent,
+    column_of,
+    draw_strip,
+    frame_at,
+    frames_ahead,
+)
 from annotations.ui.session import Session
 from annotations.ui.task import open_view
-from annotations.ui.timeline import GUTTER, StripContent, column_of, draw_strip, frame_at
 from annotations.validate import (
     MarkedClip,
     agreement,

@@ -25,10 +25,9 @@ from textual.widgets import Input
 from annotations import cli
 from annotations.labels import append_label, current_labels, make_mark, read_labels
 from annotations.ui import app as app_module
-from annotations.ui.picture import Aim, PicturePane, other_cameras
+from annotations.ui.panes import Aim, CurveStrip, PicturePane, other_cameras
 from annotations.ui.task import TaskScene
 from annotations.ui.theme import GROUPS
-from annotations.ui.timeline import CurveStrip
 from annotations.ui.words import fit, hint_line
 from express50.capture.index import read_index
 from express50.errors import AnnotationError

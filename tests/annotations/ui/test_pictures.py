@@ -11,7 +11,7 @@ from textual.geometry import Size
 from annotations.ui.app import AnnotateApp
 from annotations.ui.frames import FrameCrop
 from annotations.ui.images import COLOURS, SIXEL_PIXELS, SixelPainter, encode_sixel, quantise
-from annotations.ui.picture import PicturePane, shot_of
+from annotations.ui.panes import PicturePane, shot_of
 from annotations.ui.session import Session
 
 SHOT = FrameCrop("S1", "cam", 3, (0.0, 0.0, 1.0, 1.0), 8, 8)
