@@ -50,7 +50,7 @@ def run(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> Result:
     """Suggest, accept and write ``suggestions.json``, ``peaks.json`` and a contact sheet."""
     from annotations.align.stage import run as work
 
-    return work(dataset, item, out, accept=config.accept, match=config.match)
+    return work(dataset, item, out, **vars(config))
 
 
 STAGE = Stage(

@@ -49,10 +49,7 @@ def run(dataset: Dataset, item: str, config: ObserveConfig, out: Path) -> Result
     """Write ``observations.npz`` and a picture of the watching cameras at rest."""
     from annotations.observe.stage import run as work
 
-    return work(
-        dataset, item, out, cameras=config.cameras, stride=config.stride,
-        min_score=config.min_score, search=config.search,
-    )  # fmt: skip
+    return work(dataset, item, out, **vars(config))
 
 
 STAGE = Stage(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 
-from express50.errors import FormatError, nearest
+from express50.errors import FormatError, check_known
 
 NEUTRAL = "neutral"  # the resting face, which has no peak
 
@@ -59,10 +59,5 @@ def select(ids: list[str] | tuple[str, ...] | None = None) -> tuple[Expression, 
     script = {expression.id: expression for expression in load_script()}
     if ids is None:
         return tuple(script.values())
-    for wanted in ids:
-        if wanted not in script:
-            raise FormatError(
-                f"expression {wanted!r} is not in the script{nearest(wanted, script)}; "
-                f"expected ids such as {', '.join(list(script)[:3])}"
-            )
+    check_known("the script", "expression", ids, script, FormatError)
     return tuple(script[wanted] for wanted in ids)

@@ -53,9 +53,6 @@ def head_files(spec: str) -> dict[str, Path]:
 
 def companions(path: Path) -> dict[str, Path]:
     """Return those of a FLAME pickle's other files that are there."""
-    found = {}
-    for kind, names in COMPANIONS.items():
-        file = next((path.parent / name for name in names if (path.parent / name).is_file()), None)
-        if file is not None:
-            found[kind] = file
-    return found
+    files = {kind: [path.parent / name for name in names] for kind, names in COMPANIONS.items()}
+    there = {kind: next(filter(Path.is_file, beside), None) for kind, beside in files.items()}
+    return {kind: file for kind, file in there.items() if file is not None}

@@ -278,14 +278,9 @@ def _first_free(taken: np.ndarray, width: float, height: float) -> tuple[int, in
     scale = 1.0
     while scale >= LEAST:
         rows, columns = max(2, round(height * scale)), max(2, round(width * scale))
-        total = np.pad(np.cumsum(np.cumsum(taken, 0), 1), ((1, 0), (1, 0)))
-        inside = (
-            total[rows:, columns:]
-            - total[:-rows, columns:]
-            - total[rows:, :-columns]
-            + total[:-rows, :-columns]
-        )
-        free = np.argwhere(inside == 0)
+        window = np.ones((rows, columns), np.uint8)
+        inside = cv2.dilate(taken.astype(np.uint8), window, anchor=(0, 0))
+        free = np.argwhere(inside[: GRID - rows + 1, : GRID - columns + 1] == 0)
         if len(free):
             return int(free[0, 0]), int(free[0, 1]), rows, columns
         scale *= SHRINK
