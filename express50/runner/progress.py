@@ -58,12 +58,15 @@ def showing(stage: str, total: int, enabled: bool) -> Iterator[Callable[[Receipt
 
 
 class RunLog:
-    """One run of a stage, in the ledger's table of runs."""
+    """One run of a stage, in the ledger's table of runs.
 
-    def __init__(self, ledger: Path, stage: str, items: int) -> None:
+    Until `current` is called, ``made`` items count as up to date.
+    """
+
+    def __init__(self, ledger: Path, stage: str, items: int, made: int = 0) -> None:
         now = time.time()
         self._path = ledger
-        self._run = Run(stage=stage, items=items, begun=now, seen=now)
+        self._run = Run(stage=stage, items=items, current=made, begun=now, seen=now)
         self._lock = threading.Lock()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="run log", daemon=True)
@@ -79,9 +82,9 @@ class RunLog:
         self._thread.join()
 
     def current(self, count: int) -> None:
-        """Count the items that are up to date already."""
+        """Say how many items are up to date already."""
         with self._lock:
-            self._run = replace(self._run, current=self._run.current + count)
+            self._run = replace(self._run, current=count)
 
     def begin(self, item: str) -> None:
         """Note that an item is being worked on."""

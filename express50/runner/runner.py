@@ -195,7 +195,9 @@ def run_stage(
                 words = f"{count_of(len(aside), 'item')} ({few(aside)})"
                 write(f"{stage.name}: set aside {words}, which it no longer makes")
             ledger.forget(stage.name, gone)
-        with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
+        former = ledger.read(stage.name)
+        made = sum(item in former and not former[item].reason for item in chosen)
+        with RunLog(dataset.ledger, stage.name, len(chosen), made) as log:
             if shortage := expected_shortage(dataset, ledger, stage.name, chosen):
                 raise NotReadyError(shortage)
             work = _sort_items(stage, dataset, config, chosen, ledger, pool.threads)

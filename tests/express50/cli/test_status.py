@@ -23,8 +23,10 @@ from express50.cli.status import SILENT_SECONDS, UNLOCKED_SECONDS, read_status, 
 from express50.console import format_seconds
 from express50.contract.layout import Dataset
 from express50.runner import executor, worker
+from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger, Receipt, Run
 from express50.runner.publish import is_running
+from express50.runner.runner import run_stage
 from pipelines import ingest
 from tests.faults import toy
 from tests.synth import make_capture
@@ -256,6 +258,24 @@ def test_a_worker_whose_clock_is_behind_does_not_stop_the_run(tmp_path, monkeypa
     toy.run_toy(dataset, workers=0)
     row = status_of_toy(dataset)
     assert (row.state, row.counts()["done"], row.counts()["to do"]) == ("done", 2, 0)
+
+
+def test_finished_items_are_not_to_do_while_a_run_looks_what_has_changed(tmp_path):
+    dataset = toy.make_dataset(tmp_path / "data", ["a", "b"])
+    toy.run_toy(dataset, workers=0)
+    (dataset.root / "in" / "c.txt").write_text("new")
+    seen = []
+
+    def inputs(dataset, item, config):
+        row = first_with(dataset, lambda row: row.state == "running")
+        seen.append((row.done, row.to_do))
+        return toy.inputs(dataset, item, config)
+
+    stage = replace(toy.STAGE, inputs=inputs)
+    run_stage(stage, dataset, toy.ToyConfig(), pool=Pool(0), progress=False)
+    assert seen == [(2, 1)] * 3
+    row = status_of_toy(dataset)
+    assert (row.state, row.done, row.to_do) == ("done", 3, 0)
 
 
 def test_a_killed_run_counts_as_stopped(tmp_path):
