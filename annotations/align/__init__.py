@@ -55,7 +55,7 @@ def run(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="align",
-    version=8,
+    version=9,
     config=AlignConfig,
     items=Dataset.subjects,
     inputs=inputs,

@@ -45,7 +45,7 @@ def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -
         )
     found, dropped = suggest_for(dataset, index, match)
     labels = accept_sure(dataset, index, found, accept)
-    dropped += _missing_peaks(index, found, labels, accept)
+    dropped += _missing_peaks(dataset, index, found, labels, accept)
     peaks = {e: x for e, x in labels.items() if x.frame is not None and not lost_frame(index, x)}
     if not peaks:
         raise StageError(f"{item}: no expression has a frame ({dropped[0].why})")
@@ -171,24 +171,26 @@ def _automatic(labels: list[Label]) -> dict[str, Label]:
 
 
 def _missing_peaks(
-    index: Index, found: Mapping[str, Suggested], labels: Mapping[str, Label], threshold: float
-) -> list[Note]:
+    dataset: Dataset, index: Index, found: Mapping[str, Suggested], labels: Mapping[str, Label],
+    threshold: float,
+) -> list[Note]:  # fmt: skip
     """Note the expressions that have no frame, with the reason."""
-    notes = []
+    place = f"{index.subject} EXPRESSION FRAME"  # expressions of one reason share a line
+    mark, notes = advised("express50 annotate mark", dataset.root, place), []
     for expression in (cue.expression_id for cue in index.cues):
         label, suggested = labels.get(expression), found.get(expression)
         if label is not None and (gone := lost_frame(index, label)):
-            why = f"labelled by {label.annotator}: {gone}; label it again with 'express50 annotate'"
+            why = f"labelled by {label.annotator}: {gone}; label it again: {mark}"
         elif label is not None and label.frame is not None:
             continue
         elif label is not None:
             why = f"flagged: {label.reason or 'no reason given'}"
         elif suggested is None:
-            why = "no face was seen in its cue window; label it with 'express50 annotate'"
+            why = f"no face was seen in its cue window; to label it: {mark}"
         else:
             why = (
                 f"confidence {suggested.confidence:.2f} is below align.accept {threshold:g};"
-                " label it with 'express50 annotate'"
+                f" to label it: {mark}"
             )
         notes.append(Note(expression, why))
     return notes

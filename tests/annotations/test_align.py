@@ -91,6 +91,8 @@ def test_a_label_in_a_camera_that_is_gone_costs_only_its_expression(watched):
     assert run(watched, ["S001"]).ok
     dropped = {row["what"]: row["why"] for row in metrics_of(watched, "align", "S001")["dropped"]}
     assert dropped["smile"].startswith("labelled by ann: no camera 'cam9' in the footage; label it")
+    command = f"annotate mark {watched.root} S001 EXPRESSION FRAME"  # as it can be typed
+    assert command in dropped["smile"]
     why = f"labelled by ann: cam01 has {3 * FRAMES_EACH} frames, and no frame 999;"
     assert dropped["jaw_open"].startswith(why)
     assert "smile" not in peaks(watched, "S001") and "neutral" in peaks(watched, "S001")
