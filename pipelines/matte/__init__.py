@@ -95,7 +95,7 @@ def needs_gpu(config: MatteConfig) -> bool:
 
 STAGE = Stage(
     name="matte",
-    version=40,
+    version=41,
     config=MatteConfig,
     items=peak_items,
     inputs=inputs,

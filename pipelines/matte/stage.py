@@ -113,7 +113,8 @@ def run(
     if not agreeing:
         found = Agreement(unchanged="matte.agree is off")
     elif ball is None:
-        found = Agreement(unchanged="the cameras do not look at one place")
+        alone = "it is the only camera" if len(cameras) == 1 else ""
+        found = Agreement(unchanged=alone or "the cameras do not look at one place")
     alphas = {name: matte.alpha for name, matte in mattes.items()}
     final = {
         name: corrected(alpha, found.removed.get(name), found.filled.get(name))

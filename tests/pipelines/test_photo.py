@@ -293,6 +293,8 @@ def test_a_video_is_tracked_where_a_face_half_hidden_gets_no_matte(
     assert main([*command, "--preset", "draft", "--windows", "2"]) == 0
     assert "failed clip/clip_01: StageError: clip/clip_01: no face" in "".join(capsys.readouterr())
     assert (tmp_path / "out/matte/clip/clip_00/photo.png").is_file()
+    figures = json.loads((tmp_path / "out/matte/clip/clip_00/metrics.json").read_text())
+    assert figures["unchanged"] == "it is the only camera"  # of which none can look elsewhere
     assert (tmp_path / "out/track/clip/sequence.npz").is_file()
 
 
