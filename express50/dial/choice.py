@@ -196,12 +196,14 @@ def item_seconds(load: Workload, stage: Stage, label: str) -> tuple[int, float]:
 def taken_over(load: Workload, trial: Trial) -> dict[str, tuple[str, float]]:
     """Return, by stage, a trial's setting and the share of the items that a run takes from it.
 
-    If the trial had fewer expressions than the script, an item that covers all of them differs, and
+    An item that covers all expressions or all subjects differs if the trial had fewer of them, and
     so does everything after it.
     """
-    found, whole = {}, trial.footage.expressions >= trial.scripted
+    seen = trial.footage
+    whole = {"subjects": load.footage.subjects, "expressions": trial.scripted}
+    found, fewer = {}, {name for name, size in whole.items() if getattr(seen, name) < size}
     for stage in load.stages:
-        if stage.name in trial.failed or (not whole and "expressions" in stage.growth.time):
+        if stage.name in trial.failed or fewer & {*stage.growth.time}:
             break
         if stage.name in trial.costs:
             label = trial.settings[stage.name]

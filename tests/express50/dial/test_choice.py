@@ -1,6 +1,7 @@
 """The error that remains at the most expensive settings, and how differences are measured."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from benchmarks.budget import Run, figures, quick_budgets
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, NoSettings, Stage
-from express50.dial.choice import Workload, front, remaining_square, size_factor
+from express50.dial.choice import Workload, front, remaining_square, size_factor, taken_over
 from express50.dial.figures import Cost, Footage, PilotFigures, Trial
 from express50.dial.results import RESULTS
 from express50.head.load import load_head
@@ -166,3 +167,12 @@ def test_smaller_pictures_that_take_longer_to_make_stay_a_choice_for_what_they_s
     points = front(reducing_chain(4.0))
     found = [(point.settings["cut"], point.seconds) for point in points]
     assert found == [("draft", 5 + 4 + 2), ("standard", 5 + 3 + 14)]
+
+
+def test_an_item_of_all_subjects_is_not_taken_from_a_trial_of_one():
+    load = reducing_chain(1.0)
+    last = replace(load.stages[-1], growth=Growth(items=(), time=("subjects",)))  # as of `pack`
+    load = replace(load, stages=[*load.stages[:-1], last])
+    trial, two = load.measured.trials[0], replace(load.footage, subjects=2.0)
+    assert [*taken_over(load, trial)] == ["read", "cut", "map"]
+    assert [*taken_over(replace(load, footage=two), trial)] == ["read", "cut"]
