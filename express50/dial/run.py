@@ -189,7 +189,9 @@ def _measure_and_run(
         ended(stage, summary)
     whole = len(summaries) == len(chain.stages) and not _any_left(summaries)
     stated = stated_errors(chain, chain.dataset) if summaries else {}
-    rest = 0.0 if whole else point_of(run.workload(), run.state.settings).seconds
+    rest = 0.0
+    if not whole:  # at the speed that was seen
+        rest = run.slowness() * point_of(run.workload(), run.state.settings).seconds
     run.state = replace(run.state, spent=clock.now())
     run.keep(finished=whole, stated=stated, rest=rest)
     if whole and not run.measured.untried:  # else a larger budget goes on with them
@@ -283,14 +285,13 @@ def _run_ready(run: _Run, stage: Stage, chosen: list[str] | None) -> Summary:
     items, item = item_seconds(load, stage, label)
     factor = size_factor(load, stage, run.state.settings)
     slow, early = run.slowness(), 0.0
-    nothing_to_make = point_of(load, run.state.settings).each[stage.name] == 0
-    if clock.budget:
-        each = front(load)[0].each  # the quickest that may follow
-        rest = sum(each[name] for name in chain.names[chain.names.index(stage.name) + 1 :])
-        early = reserved(each[stage.name] * slow, rest * slow, clock.left(), clock.budget.seconds)
     item *= factor * slow
-    if nothing_to_make and clock.budget:  # what a trial made is only moved, after the end as well
-        item, early = -GRACE * clock.budget.seconds, 0.0
+    if clock.budget:
+        each, left = front(load)[0].each, clock.left()  # the quickest that may follow
+        rest = sum(each[name] for name in chain.names[chain.names.index(stage.name) + 1 :])
+        early = reserved(each[stage.name] * slow, rest * slow, left, clock.budget.seconds)
+        if left - early < item:  # no item would begin, and a later run needs what is made now
+            early = 0.0
     clock.expect(item, early)
     before = clock.now()
     config = chain.ladders[stage.name][label]
@@ -306,10 +307,13 @@ def reserved(own: float, rest: float, left: float, budget: float) -> float:
     """Return the seconds that a stage must leave to those after it.
 
     If its own seconds and the rest exceed the time left by at most a tenth of the budget, the run
-    continues and ends late, rather than with nothing made.
+    continues and ends late, rather than with nothing made. If by more, all stages get their shares
+    of the time, so that some subjects go through all of them.
     """
     short = own + rest - left
-    return rest - short if 0 < short <= GRACE * budget else rest
+    if 0 < short <= GRACE * budget:
+        return rest - short
+    return rest * min(1.0, max(0.0, left) / max(own + rest, 1e-9))
 
 
 def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str]:
@@ -335,7 +339,7 @@ def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str
         more = budget_text(1.1 * state.rest, cores)
         if more == state.budget:  # which would be the same run, whose time is over
             more = budget_text(1.3 * state.rest, cores)
-        yield f"the time is over; left: {', '.join(left)}; all that is finished is kept"
+        yield f"no time was left for the rest: {', '.join(left)}; all that is finished is kept"
         yield (
             f"to make the rest, run again with --budget {more} or more; what was spent so far does"
             " not count"

@@ -368,8 +368,13 @@ def _run_items(
             settle(receipt)
         if work.tasks:
             with run_folder(dataset, stage.name) as folder:
-                tasks = [replace(task, folder=folder) for task in work.tasks]
-                pool.run(tasks, settle_task, begin, monitor.closed if monitor else lambda: False)
+                kept: list[Task] = []  # these are only moved, so that no monitor stops them
+                rest: list[Task] = []
+                for task in work.tasks:
+                    there = is_kept(dataset, stage.name, task.item, task.fingerprint)
+                    (kept if there else rest).append(replace(task, folder=folder))
+                pool.run(kept, settle_task, begin)
+                pool.run(rest, settle_task, begin, monitor.closed if monitor else lambda: False)
     ledger.keep_digests()
     return outcomes
 

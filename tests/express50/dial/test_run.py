@@ -291,7 +291,24 @@ def test_time_that_runs_out_leaves_items_for_a_larger_budget(tmp_path, captures,
 def test_a_run_that_is_a_little_short_of_time_continues():
     assert reserved(own=5, rest=20, left=30, budget=40) == 20
     assert reserved(own=5, rest=20, left=22, budget=40) == 17  # late by 3 of 40
-    assert reserved(own=5, rest=20, left=20, budget=40) == 20  # by 5: what is left is not begun
+    assert reserved(own=5, rest=20, left=20, budget=40) == 16  # by 5: each gets four fifths
+
+
+def test_a_run_that_falls_behind_spends_its_time_and_keeps_what_trials_made(
+    tmp_path, captures, monkeypatch
+):
+    """S0 is whole after the trial; S1 would take 48 of the 30 s. Nothing of either was made."""
+    count_pauses(monkeypatch)
+    monkeypatch.setattr("express50.dial.pilot.LIKELY_RATIO", 1e9)
+    measured_figures(chain_of(tmp_path / "d", captures[:2]), Clock(parse_budget("0.0083ch")))
+    monkeypatch.setenv(PAUSE, "4")
+    monkeypatch.setattr("express50.dial.run._Run.slowness", lambda run: 4.0)
+    summaries, state = go(tmp_path / "d", captures[:2], "0.0083ch")
+    counts = {s.stage: [s.count(w) for w in ("done", "failed", "left")] for s in summaries}
+    assert counts["solve"] == [2, 0, 0] and counts["map"] == [5, 0, 3]
+    assert {o.item for o in summaries[-1].outcomes if o.restored} == {f"S0/e{n}" for n in range(4)}
+    assert 0.8 * 29.9 < state.spent <= 29.9
+    assert state.rest == pytest.approx(3 * 2 * 4)  # at the speed that was seen
 
 
 def test_a_reference_that_the_trial_lacks_does_not_stop_it(tmp_path, captures):
@@ -447,7 +464,7 @@ def test_what_later_stages_cannot_begin_is_left_and_not_failed(tmp_path, capture
     counts = {s.stage: [s.count(w) for w in ("done", "failed", "left")] for s in summaries}
     assert counts["solve"] == [2, 0, 1] and counts["map"] == [5, 0, 7]
     last = list(closing_lines(state, summaries))[-2:]
-    assert "left: 1 of solve, 7 of map" in last[0] and "--budget 0.0" in last[1]
+    assert "left for the rest: 1 of solve, 7 of map" in last[0] and "--budget 0.0" in last[1]
     monkeypatch.setenv(PAUSE, "1")
     summaries, state = go(tmp_path / "d", captures, last[1].split("--budget ")[1].split()[0])
     assert state.finished and all(summary.ok for summary in summaries)
