@@ -164,14 +164,11 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
     A file that cannot be read as a video, such as a sound recording, is dropped. Without cues, the
     whole footage is one clip.
 
-    Raises:
-        CaptureError: the cameras share no footage, two names become one camera id, a picture lacks
-            its number, or cues or the board's files are malformed.
-        CalibrationError: calibration.json is malformed.
+    Raises as `read_listed` does, or CaptureError where a picture lacks its number.
     """
     names = _videos(path, footage_folder(path))
     ids = unique_ids(path, names, lambda name: Path(name).stem)
-    return _read(path, "videos", {ids[name]: {(CLIP, 0): name} for name in names}, selection)
+    return read_listed(path, "videos", {ids[name]: {(CLIP, 0): name} for name in names}, selection)
 
 
 def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
@@ -193,7 +190,7 @@ def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
             sequence = CLIP if one_clip else name.removeprefix(folder).strip("_- ") or name
             for file in _files(path, tree, place):
                 _add(rows[folder], (sequence, _number(file) if tree.kind == "frames" else 0), file)
-    return _read(path, tree.kind, rows, selection)
+    return read_listed(path, tree.kind, rows, selection)
 
 
 def read_expression_folders(path: Path, selection: Selection) -> RawCapture:
@@ -228,7 +225,7 @@ def _read_inner(
         for place in places:
             for file in _files(path, tree, place):
                 _add(rows[tree.name(place)], moment_of(folder, file), file)
-    return _read(path, tree.kind, rows, selection)
+    return read_listed(path, tree.kind, rows, selection)
 
 
 def _tree(path: Path) -> Tree:
@@ -312,9 +309,16 @@ def _add(row: dict[Moment, str], moment: Moment, name: str) -> None:
     row[moment] = name
 
 
-def _read(
+def read_listed(
     path: Path, kind: str, rows: Mapping[str, Mapping[Moment, str]], selection: Selection
 ) -> RawCapture:
+    """Read a rig whose files are listed by camera and moment, and what lies beside them.
+
+    Raises:
+        CaptureError: the cameras share no footage, two names become one camera id, or cues or the
+            board's files are malformed.
+        CalibrationError: calibration.json is malformed.
+    """
     ids = unique_ids(path, rows, str)
     sequences = sorted({sequence for row in rows.values() for sequence, _ in row})
     check_selection(selection, sequences, sorted(ids.values()))

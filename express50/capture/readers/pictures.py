@@ -10,16 +10,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from express50.capture.raw import (
-    IMAGE_SUFFIXES,
-    RawCamera,
-    RawCapture,
-    image_names,
-    read_calibration,
-    read_plates,
-    unused_files,
-)
-from express50.capture.readers.folders import footage_folder, pictures_in
+from express50.capture.raw import IMAGE_SUFFIXES, RawCapture, image_names
+from express50.capture.readers.folders import FPS, footage_folder, pictures_in, read_listed
 from express50.capture.readers.selection import (
     Moment,
     Selection,
@@ -28,16 +20,14 @@ from express50.capture.readers.selection import (
     folder_id,
     unique_ids,
 )
-from express50.errors import CalibrationError, CaptureError, FormatError
+from express50.errors import CalibrationError, CaptureError
 from express50.files.containers import inside
-from express50.files.images import read_exif
 from express50.files.text import read_json_table, unreadable
 from express50.geometry.cameras import Camera
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.colmap import is_colmap, read_colmap_images
 from express50.rigs.transforms_json import camera_names, read_transforms
 
-FPS = 24.0  # meaningless for photographs
 MODELS = ("sparse/0", "sparse", ".")
 MOMENT = "photo"
 
@@ -48,40 +38,15 @@ def fits_photos(path: Path) -> bool:
 
 
 def read_photos(path: Path, selection: Selection) -> RawCapture:
-    """Read each photograph as a camera of one moment.
+    """Read each photograph as a camera of one moment; raises as `read_listed` does.
 
     Cameras are those of calibration.json; without it, calibrate solves them. A photograph whose
     EXIF says that it lies on its side is read upright.
-
-    Raises:
-        CaptureError: two names become one camera id, or no photograph can be used.
-        CalibrationError: calibration.json is malformed.
     """
     names = pictures_in(path, footage_folder(path))
     ids = unique_ids(path, names, lambda name: Path(name).stem)
-    check_selection(selection, [MOMENT], sorted(ids.values()))
-    dropped: dict[str, str] = {}
-    cameras: dict[str, RawCamera] = {}
-    for name, camera in ids.items():
-        if not selection.has_camera(camera):
-            continue
-        try:
-            turn, _ = read_exif(path / name)
-        except FormatError as error:
-            dropped[camera] = str(error)
-            continue
-        cameras[camera] = RawCamera(
-            id=camera, kind="frames", path=path, names=(name,), counts=(1,), orientation=turn
-        )
-    if not cameras:
-        reasons = "; ".join(f"{k}: {v}" for k, v in dropped.items())
-        raise CaptureError(f"{path}: no photograph can be used: {reasons}")
-    calibration = read_calibration(path, cameras, dropped)
-    return RawCapture(
-        root=path, subject=folder_id(path), fps=FPS, meta={}, cameras=cameras, dropped=dropped,
-        calibration=calibration, plates=read_plates(path, cameras),
-        clips=(selection.expression(MOMENT),), warnings=unused_files(path, ids.values()),
-    )  # fmt: skip
+    rows = {camera: {(MOMENT, 0): name} for name, camera in ids.items()}
+    return read_listed(path, "frames", rows, selection)
 
 
 def fits_colmap(path: Path) -> bool:

@@ -240,6 +240,10 @@ def test_photos_and_a_video(tmp_path):
     assert shots.calibration is None and shots.cues == (Cue("photo", 0, 0),)
     assert talk.cues == (Cue("clip", 0, 5),)
     assert read_frame(dataset, "talk", "video", 5, False).shape == (64, 64, 3)
+    for name in ("board/IMG_1/0.png", "board/board.toml"):
+        (tmp_path / "shots" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "shots" / name).touch()
+    assert read_any(tmp_path / "shots").board["cameras"] == {"IMG_1": ["board/IMG_1/0.png"]}
 
 
 def test_a_telephones_video_is_read_upright(tmp_path):
