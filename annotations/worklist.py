@@ -89,11 +89,7 @@ def coverage(dataset: Dataset) -> dict[str, dict]:
         ``missing``), ``missing`` (subject -> expressions), ``excluded`` (subject -> reason),
         ``gender`` and ``age`` counts of five or more people, where captures state them.
     """
-    cells = {}
-    for subject in included_subjects(dataset):
-        force = current_labels(read_labels(dataset, subject))
-        names = [cue.expression_id for cue in read_index(dataset, subject).cues]
-        cells[subject] = {n: origin(force[n]) if n in force else "missing" for n in names}
+    cells = {subject: _states(dataset, subject) for subject in included_subjects(dataset)}
     missing = {
         subject: [e for e, state in row.items() if state == "missing"]
         for subject, row in cells.items()
@@ -111,18 +107,24 @@ def coverage(dataset: Dataset) -> dict[str, dict]:
 
 def progress(dataset: Dataset, subject: str) -> dict[str, object]:
     """Count a subject's expressions by who labelled them."""
-    force = current_labels(read_labels(dataset, subject))
-    names = [cue.expression_id for cue in read_index(dataset, subject).cues]
-    count = Counter(origin(force[name]) for name in names if name in force)
+    states = _states(dataset, subject)
+    count = Counter(states.values())
     return {
         "subject": subject,
-        "expressions": len(names),
+        "expressions": len(states),
         "by_person": count["person"],
         "by_rule": count["rule"],
         "automatic": count["auto"],
         "flagged": count["flagged"],
         "excluded": exclusion_reason(dataset, subject),
     }
+
+
+def _states(dataset: Dataset, subject: str) -> dict[str, str]:
+    """Return who labelled each expression of a subject's cues, as `origin` does, or ``missing``."""
+    force = current_labels(read_labels(dataset, subject))
+    names = [cue.expression_id for cue in read_index(dataset, subject).cues]
+    return {name: origin(force[name]) if name in force else "missing" for name in names}
 
 
 def effort(dataset: Dataset) -> dict[str, dict[str, object]]:

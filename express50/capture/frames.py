@@ -372,13 +372,11 @@ def picture_sizes(dataset: Dataset, subject: str) -> dict[str, tuple[int, int]]:
 @cached_by_file(64)
 def _sizes_cached(path: Path) -> dict[str, tuple[int, int]]:
     fix = "delete its folder and run 'express50 frames' again"
-    table = read_json_table(path, FormatError, fix)
-    sizes = {}
-    for name, row in table.items():
-        numbers = isinstance(row, list) and all(type(n) is int and n > 0 for n in row)
-        if not numbers or len(row) != 2:
-            raise FormatError(f"{path}: {name} is {row}, expected width and height, pixels; {fix}")
-        sizes[name] = (row[0], row[1])
+    with refusing(FormatError, f"{path}: not the sizes of pictures", fix):
+        sizes = {k: (w, h) for k, (w, h) in read_json_table(path, FormatError, fix).items()}
+        for name, size in sizes.items():
+            if not all(type(n) is int and n > 0 for n in size):
+                raise ValueError(f"{name} is {size}, expected width and height, pixels")
     return sizes
 
 

@@ -48,7 +48,7 @@ UNDEVELOPED = (
 # Windows reserves these names for devices, in any letter case.
 RESERVED = {"CON", "PRN", "AUX", "NUL"}
 RESERVED |= {f"{port}{n}" for port in ("COM", "LPT") for n in range(1, 10)}
-# Files beside the footage that are read, and suffixes of others that somebody may expect to be.
+# Files beside the footage that are read; suffixes of others that somebody may expect to be read.
 FILES_READ = ("capture.toml", "cues.csv", "calibration.json")
 DATA_SUFFIXES = (".csv", ".json", ".npz", ".toml", ".xml", ".yaml", ".yml")
 CUE_COLUMNS = ("expression_id", "start_frame", "end_frame")

@@ -126,7 +126,7 @@ def cut_about(
 ) -> tuple[Camera, tuple[slice, slice]]:
     """Return the camera of the part of a picture about pixels (N, 2), and its rows and columns.
 
-    It reaches a `margin` further, and has a pixel at least.
+    The part reaches `margin` pixels further, and has at least one pixel.
     """
     size = np.array([camera.width, camera.height])
     pixels = pixels.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Undistort and sample images, measure their blur; an even choice, a smooth step, harmonics."""
+"""Undistort and sample images, measure their blur; choose evenly, step smoothly, and so on."""
 
 from __future__ import annotations
 

@@ -101,7 +101,8 @@ def render_band(
     seen = np.flatnonzero(keep.ravel() & (face != MISS))
     alpha[seen] = 1.0
     if shade is not None and seen.size:
-        colour[seen], alpha[seen] = _split(shade(grid[0, seen], face[seen], bary[seen]))
+        rgba = shade(grid[0, seen], face[seen], bary[seen])
+        colour[seen], alpha[seen] = rgba[:, :3], rgba[:, 3]
     for chosen, count in ((edge, sampling.edge), (inside & ~edge, sampling.inside)):
         index = np.flatnonzero((chosen & keep).ravel())
         for part in np.array_split(index, max(1, len(index) * count >> 18)):
@@ -177,13 +178,10 @@ def _cast_more(
     seen[hit] = 1.0
     colours = np.zeros((len(directions), 3), np.float32)
     if shade is not None and hit.size:
-        colours[hit], seen[hit] = _split(shade(directions[hit], face[hit], bary[hit]))
+        rgba = shade(directions[hit], face[hit], bary[hit])
+        colours[hit], seen[hit] = rgba[:, :3], rgba[:, 3]
     count = len(places)
     return colours.reshape(count, -1, 3).sum(0), seen.reshape(count, -1).sum(0)
-
-
-def _split(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return seen[:, :3], seen[:, 3]
 
 
 def ray_pattern(count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,14 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from express50.geometry.sampling import smoothstep
 from express50.geometry.transforms import make_transform, unit
-from express50.head.model import HeadModel, landmarks
+from express50.head.model import HeadModel, landmarks_of
 from express50.landmarks.training.scene import RING, glasses_lines
 from express50.twin.hair import HairMesh, grow_hair
 from express50.twin.subjects import PersonLook
@@ -176,7 +175,7 @@ def hold(
 
 def _marks_on(model: HeadModel, vertices: np.ndarray) -> np.ndarray:
     """Return the landmarks (68, 3) of a head with these vertices (V, 3)."""
-    return landmarks(model, torch.from_numpy(vertices[None]).to(model.template))[0].double().numpy()
+    return landmarks_of(model, vertices.astype(np.float32)).astype(np.float64)
 
 
 def _tube(path: np.ndarray, radius: np.ndarray | float, colour: np.ndarray, closed: bool = False):
