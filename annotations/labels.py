@@ -84,21 +84,17 @@ def make_mark(
     source = index.cameras[camera]
     end = min(cue.end_frame, source.frames - 1)
     low, high = cue.start_frame if first is None else first, end if last is None else last
-    if not cue.start_frame <= frame <= end:
-        raise AnnotationError(
-            f"{index.subject} {expression}: frame {frame} is outside its cue window; "
-            f"expected {cue.start_frame} to {end}"
-        )
-    if not low <= frame <= high:
-        raise AnnotationError(
-            f"{index.subject} {expression}: frame {frame} is outside its plateau, {low} to {high};"
-            " move the mark or the plateau's ends"
-        )
-    if not cue.start_frame <= low <= high <= end:
-        raise AnnotationError(
-            f"{index.subject} {expression}: plateau {low} to {high} leaves the cue window; expected"
-            f" {cue.start_frame} to {end} or less"
-        )
+    window, plateau = f"{cue.start_frame} to {end}", f"{low} to {high}"
+    for fits, what in (
+        (cue.start_frame <= frame <= end,
+         f"frame {frame} is outside its cue window; expected {window}"),
+        (low <= frame <= high,
+         f"frame {frame} is outside its plateau, {plateau}; move the mark or the plateau's ends"),
+        (cue.start_frame <= low <= high <= end,
+         f"plateau {plateau} leaves the cue window; expected {window} or less"),
+    ):  # fmt: skip
+        if not fits:
+            raise AnnotationError(f"{index.subject} {expression}: {what}")
     return replace(
         make_event(index, expression, "mark", annotator),
         frame=frame,

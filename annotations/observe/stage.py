@@ -6,11 +6,11 @@ single detections out of the curves in which expressions are searched for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -187,34 +187,17 @@ def _observe_camera(
     def read(number: int) -> np.ndarray:
         return read_proxy(dataset, subject, camera, number)
 
-    places, sure = find_points(net, Frames(read, rest), smallest)
+    places, sure = find_points(net, read, rest.tolist(), smallest)
     neutral = np.median(places[sure >= min(SEEN_SCORE, sure.max())], axis=0)
     seen: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     for window in windows:
-        images = Frames(read, window)
-        points, scores = find_points(net, images, smallest)
-        faces = align_faces(images, points, neutral)
-        seen |= dict(zip(window.tolist(), zip(points, scores, faces, strict=True), strict=True))
+        numbers = window.tolist()
+        points, scores = find_points(net, read, numbers, smallest)
+        faces = align_faces(map(read, numbers), points, neutral)
+        seen |= dict(zip(numbers, zip(points, scores, faces, strict=True), strict=True))
     rows = [seen[number] for number in sorted(seen)]
     points, scores, faces = (np.stack(part) for part in zip(*rows, strict=True))
     return points, scores, faces
-
-
-class Frames(Sequence[np.ndarray]):
-    """The frames of a window, read when asked for: a long window may not fit in memory."""
-
-    def __init__(self, read: Callable[[int], np.ndarray], numbers: np.ndarray) -> None:
-        self._read, self._numbers = read, numbers.tolist()
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self._numbers)
-
-    def __getitem__(self, place: Any) -> Any:
-        """Read a frame (H, W, 3) uint8, or a list of them for a slice."""
-        if isinstance(place, slice):
-            return [self._read(number) for number in self._numbers[place]]
-        return self._read(self._numbers[place])
 
 
 FACE = 48  # side of the aligned face, pixels
@@ -228,10 +211,11 @@ STEADY_FRAMES = 1.0  # heads turn slowly: their motion is averaged over this man
 
 
 def find_points(
-    net: LandmarkNet, images: Sequence[np.ndarray], smallest: float
+    net: LandmarkNet, read: Callable[[int], np.ndarray], frames: Sequence[int], smallest: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find landmarks (T, 68, 2), corner-origin pixels, and scores (T,) in T frames (H, W, 3) uint8.
+    """Find landmarks (T, 68, 2), corner-origin pixels, and scores (T,) in T frames.
 
+    `read` returns the image (H, W, 3) uint8 of a frame: not all of a long clip fit in memory.
     The face is searched for in the middle frame only, in windows from ``smallest`` on (`detect`).
     All frames and their mirror images are then looked at through the same window, except those
     where the face has left it.
@@ -241,12 +225,13 @@ def find_points(
     from express50.landmarks.detector import detect, window_about
     from express50.landmarks.network import CROP, MIRROR, as_input, face_box
 
-    middle = detect(net, images[len(images) // 2], smallest=smallest)
+    middle = detect(net, read(frames[len(frames) // 2]), smallest=smallest)
     centre, side = face_box(middle.points)
     window = window_about(middle.points)
-    points, scores = np.zeros((len(images), 68, 2)), np.zeros(len(images))
-    for start in range(0, len(images), BATCH):
-        crops = np.stack([_cut(image, window, CROP) for image in images[start : start + BATCH]])
+    points, scores = np.zeros((len(frames), 68, 2)), np.zeros(len(frames))
+    for start in range(0, len(frames), BATCH):
+        part = frames[start : start + BATCH]
+        crops = np.stack([_cut(read(frame), window, CROP) for frame in part])
         both = np.concatenate([crops, crops[:, :, ::-1]])
         with torch.inference_mode():
             output = net(as_input(both))
@@ -255,16 +240,16 @@ def find_points(
         batch = slice(start, start + len(crops))
         points[batch] = transform_points(window, 0.5 * (direct + mirrored))
         scores[batch] = torch.sigmoid(output.logit).double().numpy().reshape(2, -1).mean(0)
-    for row in range(len(images)):
+    for row, frame in enumerate(frames):
         away = np.linalg.norm(face_box(points[row])[0] - centre)
         if away > STRAY_SHARE * side or scores[row] < STRAY_SCORE * middle.score:
-            own = detect(net, images[row], smallest=smallest)
+            own = detect(net, read(frame), smallest=smallest)
             points[row], scores[row] = own.points, own.score
     return points, scores
 
 
 def align_faces(
-    images: Sequence[np.ndarray], points: np.ndarray, neutral: np.ndarray
+    images: Iterable[np.ndarray], points: np.ndarray, neutral: np.ndarray
 ) -> np.ndarray:
     """Cut grey faces (T, FACE, FACE) uint8 of a clip, moved onto neutral landmarks (68, 2)."""
     low, high = neutral.min(0), neutral.max(0)

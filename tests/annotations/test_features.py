@@ -136,7 +136,7 @@ def test_cameras_pair_by_name_or_else_best_with_best():
 
 def test_watching_an_empty_picture_gives_finite_points_with_a_low_score():
     images = [np.zeros((40, 30, 3), np.uint8)] * 3
-    points, scores = find_points(load_network(), images, SMALLEST)
+    points, scores = find_points(load_network(), images.__getitem__, range(len(images)), SMALLEST)
     assert points.shape == (3, 68, 2)
     assert np.isfinite(points).all()
     assert (scores < 0.5).all()
