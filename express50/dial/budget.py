@@ -86,6 +86,7 @@ class Clock:
     early: float = 0.0  # seconds of the budget reserved for later stages
     until: float = math.inf  # spent seconds after which no item begins, if before the budget's end
     core: float = 0.0
+    running: set[str] = field(default_factory=set)  # items; their processor time is not known yet
     began: float = field(default_factory=time.monotonic)
     _kept: float = 0.0
     _closed: bool = False
@@ -111,8 +112,13 @@ class Clock:
         """Set the expected seconds of the next items, the reserve for later stages, and a limit."""
         self.item, self.early, self.until, self._closed = item, early, until, False
 
+    def begun(self, item: str) -> None:
+        """Count an item as running."""
+        self.running.add(item)
+
     def settled(self, receipt: Receipt) -> None:
         """Count an item; one with 0 attempts was not made but restored."""
+        self.running.discard(receipt.item)
         self.core += receipt.core_seconds if receipt.attempts else 0.0
         if receipt.attempts and self.until < math.inf:  # a trial: what its items take is a guess
             self.item = max(self.item, receipt.core_seconds if self.cores else receipt.seconds)
@@ -123,5 +129,6 @@ class Clock:
     def closed(self) -> bool:
         """Return whether a further item would probably end after the budget, or the limit."""
         left = min(self.left() - self.early, self.until - self.now())
+        left -= len(self.running) * self.item if self.cores else 0.0
         self._closed = self._closed or left < self.item
         return self._closed

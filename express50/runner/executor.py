@@ -141,7 +141,7 @@ class Pool:
                 if waiting and closed():
                     waiting.clear()
                 workers.keep(len(waiting) + sum(map(len, running.values())))
-                while waiting and len(running) < slots:
+                while waiting and len(running) < slots and not closed():
                     fair = max(1, len(waiting) // (2 * slots))  # the last ones end together
                     batch = [waiting.popleft() for _ in range(min(size, fair))]
                     for task in batch:

@@ -46,7 +46,10 @@ KEPT = "imported; the stage does not make it"
 
 
 class RunMonitor(Protocol):
-    """Sees every receipt of a run, and may stop further items from beginning."""
+    """Sees the items and receipts of a run, and may stop further items from beginning."""
+
+    def begun(self, item: str) -> None:
+        """Take note of an item that begins."""
 
     def settled(self, receipt: Receipt) -> None:
         """Take note of an item that ended."""
@@ -333,6 +336,8 @@ def _run_items(
         make_room(dataset)
         check_space(dataset.root)
         log.begin(task.item)
+        if monitor is not None:
+            monitor.begun(task.item)
 
     total = len(work.tasks) + len(work.unreadable)
     if progress:

@@ -4,7 +4,10 @@ import pytest
 
 from express50.dial.budget import Clock, parse_budget, parse_goal
 from express50.errors import ConfigError
+from express50.runner.executor import Pool
 from express50.runner.ledger import Receipt
+from express50.runner.runner import run_stage
+from tests.faults import toy
 
 
 @pytest.mark.parametrize(
@@ -42,3 +45,16 @@ def test_a_clock_counts_sessions_and_closes_before_what_does_not_fit():
     assert clock.closed()
     clock.expect(item=5.0)
     assert not clock.closed()
+
+
+def test_workers_begin_no_more_than_the_core_hours_left_pay_for(tmp_path):
+    """Processor time is known only at an item's end: both workers began although one item fits."""
+    names = ["a", "b", "c", "d"]
+    clock = Clock(parse_budget("0.002ch"))  # 7.2 s
+    clock.expect(item=4.0)
+    with Pool(2) as pool:
+        summary = run_stage(
+            toy.STAGE, toy.make_dataset(tmp_path, names), toy.ToyConfig(seconds=0.1), pool=pool,
+            progress=False, monitor=clock,
+        )  # fmt: skip
+    assert (summary.count("done"), summary.count("left")) == (1, 3)

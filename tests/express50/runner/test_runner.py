@@ -180,6 +180,9 @@ class OneItem:
     def __init__(self):
         self.seen = []
 
+    def begun(self, item):
+        pass
+
     def settled(self, receipt):
         self.seen.append(receipt)
 
