@@ -53,10 +53,10 @@ OUT_OF_MEMORY = re.compile("out of memory|can't allocate memory", re.IGNORECASE)
 AMOUNT = re.compile(r"llocate ([\d.]+ \w+)")
 
 # Words of a figure's name as readers write them; units go to its end.
-UNITS = {"db": "dB", "mm": "mm", "m": "m", "px": "px", "gib": "GiB"}
+UNITS = {"db": "dB", "deg": "degrees", "mm": "mm", "m": "m", "px": "px", "gib": "GiB"}
 SPELLINGS = {
     "psnr": "PSNR", "ssim": "SSIM", "rmse": "RMSE", "lpips": "LPIPS", "fid": "FID", "iou": "IoU",
-    "heldout": "held-out",
+    "heldout": "held-out", "mae": "MAE", "rms": "RMS",
 }  # fmt: skip
 
 

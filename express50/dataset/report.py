@@ -206,8 +206,8 @@ def _words(name: str) -> str:
 
 
 def number(value: object) -> str:
-    """Format a figure for readers; n/a if it was not measured."""
-    if value is None:
+    """Format a figure for readers; n/a if it was not measured, or names nothing."""
+    if value is None or value == "":
         return "n/a"
     if not is_number(value):
         return str(value)
