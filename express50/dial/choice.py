@@ -475,7 +475,13 @@ def _why(load: Workload, stage: Stage, point: Point) -> str:
             seconds *= size_factor(load, stage, point.settings)
             time = f"{format_seconds(abs(seconds))} {'more' if seconds > 0 else 'less'}"
             words.append(f"{other}: {time}, {_change(load, name, label, other, point)}")
-    if untried:
+    configs, alike = load.ladders[name], []
+    if stage.growth.reduces:
+        size = {n: load.footage.after(stage.growth, c).picture for n, c in configs.items()}
+        alike = [other for other in untried if size[other] == size[label]]
+    if alike:
+        words.append(f"{', '.join(alike)}: the same, as no recorded picture is larger")
+    if untried := [one for one in untried if one not in alike]:
         words.append(f"{', '.join(untried)}: not tried")
     return "; ".join(words)
 

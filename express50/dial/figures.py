@@ -57,6 +57,11 @@ class Footage:
         """Return the size that the seconds of a stage's item are proportional to."""
         return replace(self, pixels=self._at_most(growth.side)).work(growth.time)
 
+    def after(self, growth: Growth, config: Any) -> Footage:
+        """Return this footage after a stage, whose settings may reduce its pictures."""
+        key = growth.reduces
+        return replace(self, side=float(getattr(config, key))) if key else self
+
     def items(self, growth: Growth) -> float:
         """Return the number of items of a stage."""
         return self.work(growth.items) + (self.work(growth.more) if growth.more else 0.0)

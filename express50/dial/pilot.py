@@ -365,13 +365,13 @@ def _steps(pilot: Pilot, base: Trial, choices: Sequence[str]) -> list[tuple[str,
 
     Those whose trials are quicker come first. Larger pictures than were recorded change nothing.
     """
-    steps, reduces = [], {stage.name: stage.growth.reduces for stage in pilot.chain.stages}
+    steps, growth = [], {stage.name: stage.growth for stage in pilot.chain.stages}
     for name in choices:
-        configs = pilot.chain.ladders[name]
+        configs, seen = pilot.chain.ladders[name], base.footage
         higher = list(configs)[list(configs).index(base.settings[name]) + 1 :]
-        if key := reduces[name]:
-            seen = {one: replace(base.footage, side=getattr(configs[one], key)) for one in higher}
-            higher = [one for one in higher if seen[one].picture > base.footage.picture]
+        if growth[name].reduces:
+            size = {one: seen.after(growth[name], configs[one]).picture for one in higher}
+            higher = [one for one in higher if size[one] > seen.picture]
         seconds = trial_seconds(pilot, base, name)
         steps += [(rank, seconds, (name, label)) for rank, label in enumerate(higher)]
     return [step for _, _, step in sorted(steps)]
@@ -398,10 +398,8 @@ def guessed(pilot: Pilot, base: Trial, name: str, label: str, factor: float) -> 
     Later stages take as long as before, but longer where the setting makes their pictures larger.
     """
     stages = pilot.chain.stages[pilot.chain.names.index(name) :]
-    reduces, footage, costs = stages[0].growth.reduces, base.footage, dict(base.costs)
-    if reduces:
-        side = getattr(pilot.chain.ladders[name][label], reduces)
-        footage = replace(footage, side=float(side))
+    config, costs = pilot.chain.ladders[name][label], dict(base.costs)
+    footage = base.footage.after(stages[0].growth, config)
     for stage in (one for one in stages if one.name in costs):
         more = footage.time(stage.growth) / base.footage.time(stage.growth)
         more, cost = factor if stage.name == name else more, costs[stage.name]

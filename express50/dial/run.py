@@ -225,7 +225,7 @@ def _first_choice(run: _Run, load: Workload) -> Point:
             how = f"takes about {need}, which is more than --budget"
         else:
             best = min((p.errors[name] for p in points), key=lambda error: error.value)
-            how = f"the best that any settings give is {error_text(name, best)}"
+            how = f"the best that any settings give is {error_text(name, best)}; give a larger one"
             if untried := [f"{n} {' and '.join(more)}" for n, more in run.measured.untried.items()]:
                 how = f"the best of the settings that were tried is {error_text(name, best)};"
                 how += f" there was no time to try {', '.join(untried)}; give a larger --budget"

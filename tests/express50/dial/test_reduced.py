@@ -12,14 +12,13 @@ from express50.capture.index import peak_items
 from express50.contract.layout import Dataset
 from express50.contract.stage import ExpectedError, Growth, Result, Stage
 from express50.dial.budget import parse_budget
-from express50.dial.figures import dial_dir
-from express50.dial.measuring import tune
+from express50.dial.choice import choice_lines, front
+from express50.dial.figures import dial_dir, read_measured
+from express50.dial.measuring import tune, workload
 from express50.dial.pilot import Chain
 from express50.dial.results import ResultKind
 from express50.dial.run import run_within
-from express50.errors import FormatError
 from express50.files.calibration import write_cameras
-from express50.files.text import read_json_table
 from express50.runner.executor import Pool
 from pipelines import ingest
 from pipelines.frames import STAGE as FRAMES
@@ -115,7 +114,9 @@ def test_pictures_that_are_small_enough_are_not_tried_whole(tmp_path, side, tria
     chain = chain_of(tmp_path / "d", captures_of(tmp_path, subjects=1, plates=True))
     chain.ladders["frames"]["draft"] = FRAMES.config(image_side=side)
     tune(chain)
-    assert (
-        len(read_json_table(dial_dir(chain.dataset) / "measured.json", FormatError)["trials"])
-        == trials
-    )
+    found = read_measured(dial_dir(chain.dataset) / "measured.json")
+    assert len(found.trials) == trials
+    load = workload(chain, found, False, {})
+    lines = "\n".join(choice_lines(load, front(load)[0], "budget 1h", 0.0))
+    assert ("standard: the same, as no recorded picture is larger" in lines) == (side == 96)
+    assert "not tried" not in lines
