@@ -212,18 +212,24 @@ def control_sheet(loaded: Checkpoint, head: HeadCodes, view: PinholeView) -> She
     directions of both codes, where there are any.
     """
     changes: dict[str, list[dict[str, tuple[float, ...]]]] = {
-        "jaw": [{"jaw": (JAW_OPEN * (step + 1) / 2, 0.0, 0.0)} for step in STEPS]
+        f"jaw: 0 to {JAW_OPEN} rad": [
+            {"jaw": (JAW_OPEN * (step + 1) / 2, 0.0, 0.0)} for step in STEPS
+        ]
     }
     for label, (name, reach) in TURNS.items():
         values = [reach * step for step in STEPS]
-        changes[label] = [{name: (0.0, v, 0.0) if name == "eyes" else (v,)} for v in values]
+        changes[f"{label}: {values[0]} to {reach} rad"] = [
+            {name: (0.0, v, 0.0) if name == "eyes" else (v,)} for v in values
+        ]
     for number, size in strongest_coefficients(loaded, 2).items():
         label, name = loaded.head.expression_names[number], f"expression.{number}"
-        changes[label] = [{name: (size * (step + 1) / 2,)} for step in STEPS]
+        values = [size * (step + 1) / 2 for step in STEPS]
+        changes[f"{label}: 0 to {size:.2g}"] = [{name: (v,)} for v in values]
     for code in ("z_id", "z_exp"):
         for number in range(min(2, len(principal_directions(getattr(loaded.model, code))))):
             name = f"{code}.{number}"
-            changes[name] = [{name: (DEVIATIONS * step,)} for step in STEPS]
+            reach = DEVIATIONS
+            changes[f"{name}: {-reach} to {reach}"] = [{name: (reach * step,)} for step in STEPS]
     rows = [
         [picture(loaded, controlled(loaded, head, change), view) for change in row]
         for row in changes.values()

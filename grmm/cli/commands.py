@@ -225,13 +225,13 @@ def render(args: argparse.Namespace) -> int:
     render.set_aside(args.out, {*videos, *sheets})
     write_image(args.out / "picture.png", picture)
     say(f"wrote {args.out / 'picture.png'}")
+    for name, sheet in sheets.items():  # before videos, which take long and may be stopped
+        render.write_sheet(args.out / f"{name}.jpg", *sheet)
+        say(f"wrote {args.out / name}.jpg")
     for name, frames in videos.items():
         log(f"drawing {name}.mp4, {view.width} x {view.height} px")
         render.write_video(args.out / f"{name}.mp4", frames, rates.get(name, RIG_RATE))
         say(f"wrote {args.out / name}.mp4")
-    for name, sheet in sheets.items():
-        render.write_sheet(args.out / f"{name}.jpg", *sheet)
-        say(f"wrote {args.out / name}.jpg")
     return OK
 
 

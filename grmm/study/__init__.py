@@ -298,7 +298,7 @@ def markdown(summary: dict) -> str:
     return "\n".join(markdown_table(["Type", *signed, "Tie", *methods], lines)) + (
         "\n"
         f"\n{summary['judgments']} of {summary['judgments_expected']} judgments by "
-        f"{summary['participants']} participants; in brackets: {summary['interval']}.\n"
+        f"{count(summary['participants'], 'participant')}; in brackets: {summary['interval']}.\n"
     )
 
 

@@ -201,6 +201,18 @@ def test_render_sets_aside_what_an_earlier_call_drew(checkpoint, tmp_path, capsy
     assert "an earlier call drew it: views.jpg\n" in capsys.readouterr().err
 
 
+def test_render_writes_its_sheets_before_a_video_that_is_stopped(checkpoint, tmp_path, monkeypatch):
+    """They were lost, after minutes of drawing, and an earlier grid.jpg stayed."""
+
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("grmm.render.write_video", stop)
+    render = ["render", str(checkpoint), str(tmp_path), "--views", "--turntable"]
+    assert main(render) == 130
+    assert {p.name for p in tmp_path.iterdir()} == {"picture.png", "grid.jpg", "views.jpg"}
+
+
 def test_residual_codes_of_others_leave_the_mesh_as_it_is(checkpoint, tmp_path):
     loaded, given = load_checkpoint(checkpoint), ["render", str(checkpoint), str(tmp_path)]
     given += ["--subject=S000", "--expression=e0"]

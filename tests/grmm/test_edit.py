@@ -212,8 +212,9 @@ def test_pictures_of_another_size_show_the_same(loaded):
 def test_sheets_have_a_row_for_everything(loaded):
     head, view = trained_head(loaded, "S000", "e0"), frontal(loaded)
     rows, labels, _ = control_sheet(loaded, head, view)
-    assert labels[:3] == ["jaw", "neck, yaw", "eyes, yaw"] and "z_exp.0" in labels
-    stretched = rows[labels.index("e0")]
+    joints = ["jaw: 0 to 0.35 rad", "neck, yaw: -0.35 to 0.35 rad", "eyes, yaw: -0.4 to 0.4 rad"]
+    assert labels[:3] == joints and "z_exp.0: -1.5 to 1.5" in labels
+    stretched = rows[next(i for i, label in enumerate(labels) if label.startswith("e0: 0 to "))]
     assert not np.array_equal(stretched[0], stretched[-1])
     (pictures,), _, captions = residual_sheet(
         loaded, head, trained_head(loaded, "S001", "e2"), view

@@ -350,6 +350,8 @@ def test_commands_make_and_table(folders, tmp_path, capsys):
     append_answer(
         tmp_path / "c", {"participant": 0, "example": 0, "question": "identity", "answer": "="}
     )
+    assert main(["study", "table", out]) == 0
+    assert "1 of 20 judgments by 1 participant; " in capsys.readouterr().out
     assert main([*make, "--names", "GRMM", "MD"]) == 2
     assert "already has answers" in capsys.readouterr().err
 
