@@ -28,14 +28,8 @@ from express50.errors import ConfigError, DiskError, DiskFullError, FormatError,
 LEAST_FREE = 100e6  # bytes; a disk with less free space counts as full
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # Linux constants
 BROKEN = {
-    errno.EIO,
-    errno.EROFS,
-    errno.ESTALE,
-    errno.ENXIO,
-    errno.ENODEV,
-    errno.EACCES,
-    errno.EPERM,
-}
+    errno.EIO, errno.EROFS, errno.ESTALE, errno.ENXIO, errno.ENODEV, errno.EACCES, errno.EPERM,
+}  # fmt: skip
 FORMER = ".former"  # suffix of a folder that was moved out of the way
 
 
@@ -149,10 +143,8 @@ def free_space(path: Path) -> float:
 
 def check_space(folder: Path) -> None:
     """Raise DiskFullError if the disk of a folder has less than `LEAST_FREE` left."""
-    free = free_space(folder)
-    if free < LEAST_FREE:
-        left, least = f"{free / 1e6:.0f}", f"{LEAST_FREE / 1e6:.0f}"
-        raise _disk_full(folder, f"{left} MB are free, expected at least {least}")
+    if free_space(folder) < LEAST_FREE:
+        raise disk_full(folder, f"expected at least {decimal(int(LEAST_FREE))}")
 
 
 @contextmanager
@@ -187,13 +179,9 @@ def naming_full_disk(path: Path, aside: Path | None = None) -> Iterator[None]:
 def disk_full(path: Path, why: str) -> DiskFullError:
     """Make the error of a full disk, which names the path and says how much is free now."""
     usage = shutil.disk_usage(nearest_existing(path))
-    return _disk_full(path, f"{why}; {decimal(int(usage.free))} are free now")
-
-
-def _disk_full(path: Path, why: str) -> DiskFullError:
     return DiskFullError(
-        f"{path}: the disk is full ({why}); free some space and run the same command again; "
-        "finished work is kept"
+        f"{path}: the disk is full ({why}; {decimal(int(usage.free))} are free now); free some"
+        " space and run the same command again; finished work is kept"
     )
 
 

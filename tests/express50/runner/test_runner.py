@@ -387,7 +387,7 @@ def test_a_nearly_full_disk_stops_before_an_item_is_computed(tmp_path, monkeypat
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
     usage = Mock(total=1e12, free=99e6)
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
-    with pytest.raises(DiskFullError, match="99 MB are free, expected at least 100"):
+    with pytest.raises(DiskFullError, match="expected at least 100.0 MB; 99.0 MB are free"):
         run_toy(dataset)
     assert receipts(dataset) == {} and not dataset.stage_dir("toy").exists()
     usage.free = 101e6
