@@ -74,12 +74,12 @@ def project_texture(
     weight = model.z_id.new_zeros(len(model.texels))
     z_id = torch.zeros_like(model.z_id[0]) if z_id is None else z_id
     z_exp = torch.zeros_like(model.z_exp[0]) if z_exp is None else z_exp
-    states: dict[int, Gaussians] = {}
+    heads: dict[tuple[str, str], Gaussians] = {}
     for index in indices:
         item = views.item(index)
-        if id(item.state) not in states:
-            states[id(item.state)] = model.geometry(z_id, z_exp, item.state)
-        colours, seen = _seen_colours(model, states[id(item.state)], item)
+        if item.key.frame not in heads:
+            heads[item.key.frame] = model.geometry(z_id, z_exp, item.state)
+        colours, seen = _seen_colours(model, heads[item.key.frame], item)
         total += seen[:, None] * colours
         weight += seen
     return total / weight.clamp_min(1e-8)[:, None], weight

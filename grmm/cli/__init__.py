@@ -221,7 +221,7 @@ TRAINING = (
 )
 CHOICE = "--subjects --expressions --cameras --images"
 PROTOCOL = "--fit-cameras --fit-expression --fit-budget"
-EDIT = "--subject --expression --expression-of --z-id-of --z-exp-of --control --camera --size"
+EDIT = "--subject --expression --expression-of --z-id-of --z-exp-of --control --camera"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,8 +279,8 @@ COMMANDS = {
     ),
     "render": GrmmCommand(
         handler=commands.render,
-        options=f"checkpoint out {EDIT} --yaw --pitch --turntable --degrees --frames --to --drive "
-        "--drive-cue --views --controls --samples --spread --seed --columns",
+        options=f"checkpoint out {EDIT} --size --yaw --pitch --turntable --degrees --frames --to "
+        "--drive --drive-cue --views --controls --samples --spread --seed --columns",
         help="draw a head, optionally edited, as pictures, sheets or videos",
         example="grmm render run/checkpoint.pt pictures --subject S002 --turntable --views \\\n"
         "      --expression-of S001/smile --control jaw.0=0.2",
@@ -297,6 +297,9 @@ COMMANDS = {
                 "help": "file to write: .html plays in a browser; .ply, .spz, and .glb with "
                 "--format splats hold splats; .glb a textured mesh, with --format arkit one with "
                 "ARKit's blend shapes; .npz all arrays and codes",
+            },
+            "--camera": {
+                "help": "camera whose colours to write, not with .html (default: a frontal one)"
             },
             "--drive": {"help": "with .html: tracked clips for it to play"},
         },

@@ -132,7 +132,7 @@ def fit(args: argparse.Namespace) -> int:
     made = args.out / "checkpoint.pt"
     if made.exists() and made.samefile(args.checkpoint):
         raise ConfigError(f"{made} is the checkpoint to fit from; name another folder")
-    if made.exists() and args.overwrite:
+    if made.exists():
         with suppress(FormatError):  # a damaged one may be replaced
             if seen_before(read_content(made)) is None:
                 raise ConfigError(f"{made} is of a training, not of a fit; name another folder")
@@ -249,10 +249,12 @@ def export(args: argparse.Namespace) -> int:
         raise ConfigError(f"{args.out}: --format {form} needs a name that ends in {ending}")
     if form != "html" and (unused := [n for n in ("drive", "shards") if getattr(args, n)]):
         raise ConfigError(f"--{unused[0]} is only for .html pages, not for {args.out.name}")
+    if form == "html" and args.camera:
+        raise ConfigError("--camera is not for .html pages: they show the head from all sides")
     _require(args, "drive", "drive_cue")
     check_results_file(args.out)
     loaded = _load(args.checkpoint)
-    head, view = _edited_head(loaded, args), camera_of(loaded, args.camera, args.size)
+    head, view = _edited_head(loaded, args), camera_of(loaded, args.camera)
     if form == "html":
         from grmm.player import export_player
         from grmm.shard_source import ShardSource

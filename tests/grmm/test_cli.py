@@ -112,7 +112,7 @@ def test_training_again_goes_on_and_refuses_what_differs(shards, tmp_path, capsy
     assert json.loads((tmp_path / "metrics.json").read_text())["iterations"] == 3
 
 
-def test_fit_reports_held_out_views_and_writes_over_nothing(checkpoint, shards, tmp_path):
+def test_fit_reports_held_out_views_and_writes_over_nothing(checkpoint, shards, tmp_path, capsys):
     fit = ["fit", str(checkpoint), str(shards), str(tmp_path / "fit"), "--subject=S002"]
     assert main([*fit, "--expression=e0", "--cameras=cam00,cam01", "--seconds=30"]) == 0
     metrics = json.loads((tmp_path / "fit" / "metrics.json").read_text())
@@ -125,8 +125,11 @@ def test_fit_reports_held_out_views_and_writes_over_nothing(checkpoint, shards, 
     assert main(fit) == 2 and main([fit[0], str(made), *fit[2:], "--overwrite"]) == 2
     assert made.read_bytes() == before, "neither a former fit nor the checkpoint read is replaced"
     trained = checkpoint.read_bytes()
-    assert main([fit[0], str(made), fit[2], str(checkpoint.parent), *fit[4:], "--overwrite"]) == 2
+    onto = [fit[0], str(made), fit[2], str(checkpoint.parent), *fit[4:]]
+    assert main([*onto, "--overwrite"]) == 2
     assert checkpoint.read_bytes() == trained, "--overwrite replaces fits, not trainings"
+    capsys.readouterr()
+    assert main(onto) == 2 and "is of a training, not of a fit" in capsys.readouterr().err
 
 
 def test_a_stopped_fit_goes_on_and_another_is_refused(
@@ -387,6 +390,8 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected one of .html, .ply, .spz"),
         (["export", "{checkpoint}", "{out}/head.html", "--format=splats"], 2,
          "--format splats needs a name that ends in .glb"),
+        (["export", "{checkpoint}", "{out}/head.html", "--camera=cam00"], 2,
+         "--camera is not for .html pages"),
         (["export", "{checkpoint}", "{out}/head.ply", "--control=jaw=3"], 2,
          "got 1 number, expected 3 with commas between, or jaw.0 to jaw.2 with one"),
     ],

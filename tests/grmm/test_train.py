@@ -318,6 +318,16 @@ def test_projected_texture_is_the_footage_where_seen_only():
     assert 0.1 < float((from_one > 0).float().mean()) < 0.5
 
 
+def test_a_texture_does_not_depend_on_which_poses_are_still_in_memory():
+    """A pose took the Gaussians of one that was dropped before, whose address it had."""
+    source = EllipsoidSource(size=32, expressions=6, cameras=1, subjects=1)
+    views, forgetful = (HeadViews(source, ellipsoid_head()) for _ in range(2))
+    forgetful._states.limit = 0
+    model = prepare(views, tiny_config()).model
+    expected, _ = project_texture(model, views, range(6))
+    assert torch.equal(project_texture(model, forgetful, range(6))[0], expected)
+
+
 def test_unknown_texels_take_the_nearest_colour():
     values = torch.tensor([[1.0], [0.0], [0.0], [3.0]])
     known = torch.tensor([True, False, False, True])
