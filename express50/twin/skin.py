@@ -33,17 +33,6 @@ from express50.twin.surface import (
     unit_to_spherical,
 )
 
-DEPTH, FLUSH = 0.35, 0.2  # strength of folds and of redness at full effort
-EFFORT = 2.5  # sum of coefficients that is full effort
-# Folds by the muscles that make them, on the subject's left and right.
-MUSCLES = {
-    "forehead": ("browInnerUp", "browOuterUp"),
-    "glabella": ("browDown",),
-    "crow": ("eyeSquint", "cheekSquint", "cheekRaiser", "mouthSmile"),
-    "cheek": ("mouthSmile", "noseSneer", "mouthUpperUp"),
-}
-SIDES = {"L": 1.0, "R": -1.0}  # the subject's left is +x
-
 
 @dataclass(frozen=True, kw_only=True)
 class SkinTexture:
@@ -201,6 +190,18 @@ def _hairiness(
     if look.hair_length_m > 0 and len(body.extras.hair.vertices):
         cover = np.maximum(cover, 0.85 * masks["scalp"])
     return np.clip(cover, 0.0, 1.0)
+
+
+DEPTH, FLUSH = 0.35, 0.2  # strength of folds and of redness at full effort
+EFFORT = 2.5  # sum of coefficients that is full effort
+# Folds by the muscles that make them, on the subject's left and right.
+MUSCLES = {
+    "forehead": ("browInnerUp", "browOuterUp"),
+    "glabella": ("browDown",),
+    "crow": ("eyeSquint", "cheekSquint", "cheekRaiser", "mouthSmile"),
+    "cheek": ("mouthSmile", "noseSneer", "mouthUpperUp"),
+}
+SIDES = {"L": 1.0, "R": -1.0}  # the subject's left is +x
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,20 +37,9 @@ from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.rigs.camera_builder import as_rig, camera_from_K, in_metres
 
-AVA256_CAMERAS = Path("decoder/camera_calibration.json")
 AVA256_SIZE, MULTIFACE_SIZE = (2668, 4096), (1334, 2048)
 SUFFIXES = (".avif", ".png", ".jpg")
 FPS = 30.0
-
-
-def fits_ava256(path: Path) -> bool:
-    """Return whether a folder is a capture of AVA-256."""
-    return (path / AVA256_CAMERAS).is_file()
-
-
-def fits_multiface(path: Path) -> bool:
-    """Return whether a folder is a capture of Multiface."""
-    return (path / "KRT").is_file() and (path / "images").is_dir()
 
 
 def subject_of(path: Path) -> str:
@@ -76,7 +65,7 @@ def read_ava256(path: Path, selection: Selection) -> RawCapture:
     with refusing(CaptureError, f"{file}: not a list of frames", columns):
         table = csv.DictReader(read_text(file, CaptureError).splitlines())
         listed = [(row["seg_id"].strip(), int(row["frame_id"][:9])) for row in table]
-    cameras = _ava256_cameras(path / AVA256_CAMERAS)
+    cameras = _ava256_cameras(path / "decoder/camera_calibration.json")
     return _read(path, "AVA-256", cameras, listed, _ava256_pictures, selection)
 
 

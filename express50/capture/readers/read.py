@@ -45,6 +45,11 @@ class Layout:
     named: bool = False  # whether it needs no test where capture.toml names it
 
 
+def _has(*names: str) -> Callable[[Path], bool]:
+    """Return a test for a folder that holds files and folders of these names."""
+    return lambda path: all((path / name).exists() for name in names)
+
+
 # The order matters: a layout that could be mistaken for another comes after it.
 LAYOUTS = (
     Layout(
@@ -53,15 +58,16 @@ LAYOUTS = (
     ),
     Layout(
         "nersemble", "calibration/camera_params.json and sequences/",
-        videos.fits_nersemble, videos.read_participant,
+        _has("calibration/camera_params.json", "sequences"), videos.read_participant,
     ),
     Layout(
         "ava256", "decoder/camera_calibration.json",
-        codec_avatars.fits_ava256, codec_avatars.read_ava256, codec_avatars.subject_of,
+        _has("decoder/camera_calibration.json"),
+        codec_avatars.read_ava256, codec_avatars.subject_of,
     ),
     Layout(
         "multiface", "KRT and images/",
-        codec_avatars.fits_multiface, codec_avatars.read_multiface, codec_avatars.subject_of,
+        _has("KRT", "images"), codec_avatars.read_multiface, codec_avatars.subject_of,
     ),
     Layout(
         "ravdess", "01-01-03-02-01-01-05.mp4",

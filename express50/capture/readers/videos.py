@@ -48,11 +48,6 @@ INTENSITIES = {"01": "normal", "02": "strong"}
 STATEMENTS = {"01": "kids", "02": "dogs"}
 
 
-def fits_nersemble(path: Path) -> bool:
-    """Return whether a folder is a participant's."""
-    return (path / CAMERAS).is_file() and (path / "sequences").is_dir()
-
-
 def read_participant(path: Path, selection: Selection) -> RawCapture:
     """Read the sequences of a participant of NeRSemble.
 
