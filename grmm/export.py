@@ -29,7 +29,7 @@ from express50.files.atomic import write_bytes
 from express50.files.images import srgb_to_linear
 from express50.geometry.meshes import encode_glb, split_seams
 from express50.geometry.shapes import check_finite
-from express50.head.model import HeadModel
+from express50.head.model import HeadModel, normals_of
 from grmm.checkpoint import Checkpoint
 from grmm.config import SCALE_RANGE_MM
 from grmm.edit import HeadCodes, controlled
@@ -165,12 +165,18 @@ def mesh_glb(
 ) -> bytes:
     """Encode the textured mesh as binary glTF; vertices are split at the UV map's seams.
 
-    ``targets`` (V, 3) by name become morph targets.
+    ``targets`` (V, 3) by name become morph targets. Without normals, viewers show flat facets.
     """
     places, uv_places, faces = split_seams(head.faces.cpu().numpy(), head.uv_faces.cpu().numpy())
     uv, picture = head.uv.cpu().numpy()[uv_places], Image.fromarray(texture)
     content = encode_glb(
-        "head", vertices[places], faces, uv=uv, baseColorTexture=picture, roughnessFactor=1.0
+        "head",
+        vertices[places],
+        faces,
+        normals=normals_of(vertices, head.faces.cpu())[places],
+        uv=uv,
+        baseColorTexture=picture,
+        roughnessFactor=1.0,
     )
     return with_morph_targets(content, places, targets) if targets else content
 
