@@ -7,7 +7,6 @@ an automatically accepted suggestion. Nothing is ever rewritten: undo is an even
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -21,6 +20,7 @@ from express50.capture.index import Cue, Index, same_hash
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, UnknownNameError, check_known
 from express50.files.atomic import lock_file, sync_directory
+from express50.files.digests import text_digest
 from express50.files.text import parse_json, read_bytes
 
 AUTOMATIC = "auto"
@@ -359,4 +359,4 @@ def human_digest(dataset: Dataset, subject: str) -> str:
         for label in current_labels(read_labels(dataset, subject)).values()
         if label.annotator != AUTOMATIC
     ]
-    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
+    return text_digest(json.dumps(rows))

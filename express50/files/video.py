@@ -21,7 +21,7 @@ import numpy as np
 from av.video.reformatter import Interpolation
 
 from express50.errors import CaptureError
-from express50.files.images import encode_jpeg, encode_png
+from express50.files.images import write_image
 from express50.files.text import check_readable, reason, refusing
 from express50.geometry.shapes import PIXEL_LIMIT
 
@@ -523,6 +523,5 @@ class ImageFootage:
 
     def write(self, image: np.ndarray) -> None:
         """Append a picture (H, W, 3) uint8 sRGB."""
-        data = encode_png(image) if self._suffix == "png" else encode_jpeg(image, 97)
-        (self._folder / f"{self._count:06d}.{self._suffix}").write_bytes(data)
+        write_image(self._folder / f"{self._count:06d}.{self._suffix}", image, quality=97)
         self._count += 1
