@@ -19,6 +19,7 @@ from pathlib import Path
 from benchmarks.common import make_parser
 from express50.__main__ import main as express50
 from express50.capture.frames import read_cameras_of, read_peak_frame, read_plate_image
+from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.files.atomic import write_json
 from express50.files.calibration import write_cameras
@@ -44,7 +45,11 @@ def write_given_capture(
             (folder / "plates").mkdir(exist_ok=True)
             write_image(folder / "plates" / f"{name}.png", plate)
     write_cameras(folder / "calibration.json", {name: known[name] for name in cameras})
-    (folder / "capture.toml").write_text(f'subject = "{subject}"\nfps = 24\n')
+    meta = read_index(dataset, subject).meta
+    stated = {key: meta[key] for key in ("consent_id", "consent", "licence") if key in meta}
+    lines = [f"{key} = {json.dumps(value)}\n" for key, value in stated.items()]
+    words = "".join([f'subject = "{subject}"\nfps = 24\n', *lines])
+    (folder / "capture.toml").write_text(words)
     rows = f"expression_id,start_frame,end_frame\n{expression},0,0\n"
     (folder / "cues.csv").write_text(rows)
     return folder
