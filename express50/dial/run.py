@@ -318,7 +318,10 @@ def reserved(own: float, rest: float, left: float, budget: float) -> float:
 
 def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str]:
     """Yield time spent, the errors that the stages state, and what is left."""
-    whole = f" of {state.budget}" if state.budget else ""
+    budget = parse_budget(state.budget) if state.budget else None
+    cores = budget is not None and budget.cores
+    whole = f" of {state.budget}" if budget else ""
+    whole += f" ({format_seconds(budget.seconds)} of core time)" if budget and cores else ""
     yield f"spent {format_seconds(state.spent)}{whole}, {format_seconds(state.seconds)} expected"
     promised = {name: said for name, said in state.promised.items() if said["stated"]}
     units = {kind.name: kind.unit for kind in RESULTS}
@@ -335,7 +338,6 @@ def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str
         yield f"{name}: no error is stated, {expected} promised"
     left = [f"{s.count('left')} of {s.stage}" for s in summaries if s.count("left")]
     if left:
-        cores = bool(state.budget) and parse_budget(state.budget).cores
         more = budget_text(1.1 * state.rest, cores)
         if more == state.budget:  # which would be the same run, whose time is over
             more = budget_text(1.3 * state.rest, cores)
