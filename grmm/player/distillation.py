@@ -57,7 +57,8 @@ class Avatar:
     codes: Tensor  # (E, K) and what it adds to the codes, which are zero for the head itself
     corners: Tensor  # (N, 3) vertices of each Gaussian's face
     weights: Tensor  # (N, 3) barycentrics
-    gradient: Tensor  # (N, 2) of the face: its tangent is [P1 - P0, P2 - P0] @ gradient
+    # (N, 2) of the face: its tangent is [P1 - P0, P2 - P0] @ gradient; 0: the axes are the head's
+    gradient: Tensor
     # (1 + K, N, 10) the head's, then per unit of a code: shift in the tangent frame, metres;
     # quaternion, wxyz, of any length; standard deviations, metres
     maps: Tensor
@@ -296,7 +297,7 @@ def _exact_parts(person: Person) -> Avatar:
         codes=codes,
         corners=model.corners,
         weights=model.barycentrics,
-        gradient=model.gradients[:, :, 0],
+        gradient=model.gradients[:, :, 0] * (model.config.frame != "head"),
         maps=torch.cat([maps[None], blends]),
         opacities=opacities,
         colours=_colours(person),

@@ -164,6 +164,10 @@ class Drawer {
       const tl = 1 / (Math.sqrt(tx * tx + ty * ty + tz * tz) || 1);
       const ml = 1 / (Math.sqrt(mx * mx + my * my + mz * mz) || 1);
       tx *= tl; ty *= tl; tz *= tl; mx *= ml; my *= ml; mz *= ml;
+      if (!g && !h) {  // the head's own axes
+        tx = rotation[0]; ty = rotation[3]; tz = rotation[6];
+        mx = rotation[2]; my = rotation[5]; mz = rotation[8];
+      }
       const sx = my * tz - mz * ty, sy = mz * tx - mx * tz, sz = mx * ty - my * tx;
       const wb = weights[2 * n], wc = weights[2 * n + 1];
       const px = ax + wb * ux + wc * vx + tx * map[0] + sx * map[1] + mx * map[2];

@@ -6,6 +6,7 @@ import io
 import json
 import re
 import shutil
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +23,7 @@ from grmm.edit import trained_head
 from grmm.evaluate import evaluate, mean, training_render
 from grmm.metrics import psnr_db
 from grmm.model import GRMM
-from grmm.player import _loss, export_player, player_page, stored
+from grmm.player import HERE, _loss, export_player, player_page, stored
 from grmm.player.distillation import (
     AvatarPose,
     all_gaussians,
@@ -42,11 +43,11 @@ from grmm.train import train
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory):
+@pytest.fixture(scope="module", params=["tangent", "head"])
+def loaded(request, tmp_path_factory):
     """A model whose decoders do something, on a head whose lower half is its jaw."""
-    out = tmp_path_factory.mktemp("run")
-    train(EllipsoidSource(size=32), ellipsoid_head(), out, tiny_config())
+    out, config = tmp_path_factory.mktemp("run"), tiny_config(model={"frame": request.param})
+    train(EllipsoidSource(size=32), ellipsoid_head(), out, config)
     result = load_checkpoint(out / "checkpoint.pt")
     head = result.head
     low = (head.template[:, 1] < 0).float()
@@ -219,6 +220,42 @@ def test_a_browser_draws_what_the_rasteriser_draws(loaded, person, avatar, tmp_p
         page.wait(f"canvas.dataset.pictures > {before + 3}")
         assert json.loads(page.value("JSON.stringify(clip.frames[0])"))[7] == 0.2
         assert page.value("find('error').hidden")
+
+
+DRAW = """
+const [page, splats, pose, out] = process.argv.slice(1), fs = require("fs");
+const text = fs.readFileSync(page, "utf8").match(/id="avatar">([^<]*)</)[1];
+const raw = require("zlib").inflateSync(Buffer.from(text, "base64"));
+const Drawer = (0, eval)(`{${fs.readFileSync(splats, "utf8")}; Drawer}`);
+const {parameters, codes, camera} = JSON.parse(pose), target = new Uint8ClampedArray(65536);
+const drawer = new Drawer(raw.buffer.slice(raw.byteOffset, raw.byteOffset + raw.byteLength));
+fs.writeFileSync(out, drawer.draw(Float32Array.from(parameters), codes, camera, target));
+"""
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_the_script_draws_what_the_rasteriser_draws(person, avatar, tmp_path):
+    """As in a browser. Pages of presets with the head's own axes turned every Gaussian."""
+    content, back = player_page(person, avatar, "S000", None, 24.0)
+    (tmp_path / "page.html").write_bytes(content)
+    view = orbit(front_view(person.loaded, 128), 25, person.loaded.model.head_centre)
+    pose = AvatarPose(parameters=person.own + person.changes[0], weights=torch.ones(1))
+    given = {
+        "parameters": pose.parameters.tolist(),
+        "codes": back.codes[0].tolist(),
+        "camera": {
+            "rotation": view.cam_from_head[:3, :3].flatten().tolist(),
+            "shift": view.cam_from_head[:3, 3].tolist(),
+            "focal": float(view.K[0, 0]),
+            "size": 128,
+        },
+    }
+    files = [tmp_path / "page.html", HERE / "splats.js", json.dumps(given), tmp_path / "picture"]
+    subprocess.run(["node", "-e", DRAW, *map(str, files)], check=True)
+    raw = np.fromfile(tmp_path / "picture", np.uint8).reshape(128, 128, 4) / np.float32(255)
+    ours = torch.from_numpy(raw[..., :3] * raw[..., 3:]).permute(2, 0, 1)
+    assert psnr_db(ours, drawn(back, pose, view).colors.detach().permute(2, 0, 1)) > 38
+    assert psnr_db(ours, full_rendering(person, pose, view).image.detach()) > 25
 
 
 def clip_frames(loaded):
