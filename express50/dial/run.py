@@ -307,12 +307,12 @@ def reserved(own: float, rest: float, left: float, budget: float) -> float:
     """Return the seconds that a stage must leave to those after it.
 
     If its own seconds and the rest exceed the time left by at most a tenth of the budget, the run
-    continues and ends late, rather than with nothing made. If by more, all stages get their shares
-    of the time, so that some subjects go through all of them.
+    continues and ends late by at most that, rather than with nothing made. If by more, all stages
+    get their shares of the time, so that some subjects go through all of them.
     """
-    short = own + rest - left
-    if 0 < short <= GRACE * budget:
-        return rest - short
+    grace = GRACE * budget
+    if 0 < own + rest - left <= grace:
+        return rest - grace
     return rest * min(1.0, max(0.0, left) / max(own + rest, 1e-9))
 
 

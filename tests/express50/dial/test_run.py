@@ -290,8 +290,25 @@ def test_time_that_runs_out_leaves_items_for_a_larger_budget(tmp_path, captures,
 
 def test_a_run_that_is_a_little_short_of_time_continues():
     assert reserved(own=5, rest=20, left=30, budget=40) == 20
-    assert reserved(own=5, rest=20, left=22, budget=40) == 17  # late by 3 of 40
+    assert reserved(own=5, rest=20, left=22, budget=40) == 16  # late by 3 of 40, or by 4
     assert reserved(own=5, rest=20, left=20, budget=40) == 16  # by 5: each gets four fifths
+
+
+def test_a_late_run_whose_items_are_slower_still_makes_everything(tmp_path, captures, monkeypatch):
+    """Predicted to be 2 s late, a run stopped as soon as an item took longer than predicted."""
+    count_pauses(monkeypatch)
+    monkeypatch.setattr("express50.dial.pilot.LIKELY_RATIO", 1e9)
+    measured_figures(chain_of(tmp_path / "d", captures), Clock(parse_budget("1ch")))
+    path = run_file(Dataset(tmp_path / "d"))
+    budget = "0.0666667ch"
+    run_within(chain_of(tmp_path / "d", captures), parse_budget(budget), None, lambda *_: None)
+    for stage in ("solve", "map"):  # 36 s
+        shutil.rmtree(tmp_path / "d" / stage)
+    left = json.loads(path.read_text()) | {"spent": 240.0 - 34.0, "finished": False}
+    write_json(path, left)
+    monkeypatch.setenv(PAUSE, "1.5")
+    _, state = go(tmp_path / "d", captures, budget)
+    assert state.finished and 240 < state.spent < 1.1 * 240
 
 
 def test_a_run_that_falls_behind_spends_its_time_and_keeps_what_trials_made(
