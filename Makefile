@@ -65,7 +65,7 @@ run: $(READY) ## run every stage on CAPTURES="dir ..." in DATASET, with settings
 	$(BIN)/express50 run $(DATASET) $(CAPTURES) --budget $(BUDGET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
 
 tune: $(READY) ## measure the error of the whole chain against its time on DATASET
-	$(BIN)/express50 tune $(DATASET) $(CAPTURES) --workers $(WORKERS)
+	$(BIN)/express50 tune $(DATASET) $(CAPTURES) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
 
 train: $(READY) ## train GRMM on DATASET's shards for an hour, or continue; the preset suits the machine
 	$(BIN)/grmm train $(DATASET)/pack/shards $(DATASET)/grmm $(TRAIN)
