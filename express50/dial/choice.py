@@ -471,8 +471,8 @@ def _why(load: Workload, stage: Stage, point: Point) -> str:
     words, untried = [], [other for other in ladder if other not in tried]
     for other in (*reversed(ladder[:here]), *ladder[here + 1 :]):
         if other in tried:
-            seconds = stage_seconds(load, stage, other) - stage_seconds(load, stage, label)
-            seconds *= size_factor(load, stage, point.settings)
+            instead = point_of(load, {**point.settings, name: other})
+            seconds = instead.each[name] - point.each[name]
             time = f"{format_seconds(abs(seconds))} {'more' if seconds > 0 else 'less'}"
             words.append(f"{other}: {time}, {_change(load, name, label, other, point)}")
     configs, alike = load.ladders[name], []

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,15 @@ import pytest
 from benchmarks.budget import Run, figures, quick_budgets
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, NoSettings, Stage
-from express50.dial.choice import Workload, front, remaining_square, size_factor, taken_over
+from express50.dial.choice import (
+    Workload,
+    choice_lines,
+    front,
+    point_of,
+    remaining_square,
+    size_factor,
+    taken_over,
+)
 from express50.dial.figures import Cost, Footage, PilotFigures, Trial
 from express50.dial.results import RESULTS
 from express50.head.load import load_head
@@ -145,10 +154,12 @@ def reducing_chain(cut_draft):
             scripted=1, costs=costs, errors={}, failed={}, folder="",
         )  # fmt: skip
 
+    whole = SimpleNamespace(side=0)
     trials = [trial("draft", (5.0, cut_draft, 2.0)), trial("standard", (5.0, 3.0, 14.0))]
     losses = {"cut": {"draft": {"mesh": 1.0}, "standard": {}}}
     return Workload(
-        stages=stages, ladders={s.name: dict.fromkeys(("draft", "standard")) for s in stages},
+        stages=stages,
+        ladders={s.name: dict.fromkeys(("draft", "standard"), whole) for s in stages},
         measured=PilotFigures(key="", trials=trials, losses=losses),
         footage=trials[0].footage, width=1, cores=True,
     )  # fmt: skip
@@ -176,3 +187,11 @@ def test_an_item_of_all_subjects_is_not_taken_from_a_trial_of_one():
     trial, two = load.measured.trials[0], replace(load.footage, subjects=2.0)
     assert [*taken_over(load, trial)] == ["read", "cut", "map"]
     assert [*taken_over(replace(load, footage=two), trial)] == ["read", "cut"]
+
+
+def test_no_setting_saves_time_over_one_that_is_made_already():
+    made = dict.fromkeys(("read", "cut", "map"), ("standard", 1.0))
+    load = replace(reducing_chain(1.0), done=[made])
+    point = point_of(load, dict.fromkeys(made, "standard"))
+    (row,) = (line for line in choice_lines(load, point, "", 0.0) if line.startswith("cut "))
+    assert "made already" in row and "draft: 1.0 s more" in row  # it said 2.0 s less
