@@ -17,7 +17,7 @@ from express50.contract.layout import Dataset
 from express50.errors import FormatError, HeadModelError, StageError, advised
 from express50.files.arrays import read_arrays
 from express50.files.digests import cached_by_file
-from express50.files.text import ID
+from express50.files.text import ID, refusing
 from express50.geometry.shapes import check_finite, check_shape
 from express50.head import HEADS, head_files
 
@@ -206,13 +206,10 @@ def _arrays_of(
         raise StageError(f"{path}: the {what} is missing; run {make or command}")
     again = f"run {make or command}{'' if make else ' again'}"
     arrays = read_arrays(path, FormatError, f"a {what}", fix=again)
-    try:
+    with refusing(FormatError, f"{path}: not a {what}", again):
         if str(arrays["schema"]) != schema:
             raise ValueError(f"schema {str(arrays['schema'])!r}, expected {schema}")
         yield arrays
-    except (KeyError, ValueError, TypeError) as error:
-        words = f"has no {error}" if isinstance(error, KeyError) else str(error)
-        raise FormatError(f"{path}: not a {what} ({words}); {again}") from None
 
 
 def read_registration(path: Path) -> Registration:

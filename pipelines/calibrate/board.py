@@ -23,6 +23,7 @@ from express50.capture.raw import VIDEO_SUFFIXES, is_shown
 from express50.errors import CalibrationError
 from express50.files.containers import read_picture
 from express50.files.images import upright
+from express50.files.text import refusing
 from express50.files.video import VideoReader, frame_times
 from express50.geometry.conventions import mirror_opencv_pixels, opencv_pixels_to_corner
 from express50.geometry.sampling import evenly
@@ -67,7 +68,8 @@ def board_from_table(table: Mapping[str, object], where: str) -> Board:
         raise CalibrationError(
             f"{where}: {', '.join(missing)} is missing; board.toml needs {', '.join(REQUIRED)}"
         )
-    try:
+    fix = "counts are integers, lengths metres"
+    with refusing(CalibrationError, f"{where}: a value has the wrong kind", fix):
         board = Board(
             squares_x=int(table["squares_x"]),  # type: ignore[call-overload]
             squares_y=int(table["squares_y"]),  # type: ignore[call-overload]
@@ -76,10 +78,6 @@ def board_from_table(table: Mapping[str, object], where: str) -> Board:
             dictionary=str(table["dictionary"]),
             legacy_pattern=bool(table.get("legacy_pattern", False)),
         )
-    except (TypeError, ValueError) as error:
-        raise CalibrationError(
-            f"{where}: a value has the wrong kind ({error}); counts are integers, lengths metres"
-        ) from error
     if problem := _problem(board):
         raise CalibrationError(f"{where}: {problem}")
     return board

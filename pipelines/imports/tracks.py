@@ -22,7 +22,7 @@ from express50.contract.stage import Note
 from express50.dataset.tracks import SCHEMA
 from express50.errors import CalibrationError, ConfigError, FormatError, StageError, few
 from express50.files.arrays import read_arrays
-from express50.files.text import read_json_table
+from express50.files.text import read_json_table, refusing
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import FLIP_YZ
 from express50.geometry.transforms import (
@@ -189,13 +189,11 @@ def _steps_of_transforms(
 
 
 def _camera_of(where: str, name: str, row: dict, axes: str) -> Camera:
-    try:
+    with refusing(CalibrationError, f"{where}: its camera cannot be read", "export it again"):
         if axes == "opencv":
             matrix = np.array(row["transform_matrix"], float)
             row = row | {"transform_matrix": (matrix @ FLIP_YZ).tolist()}
         return frame_camera(where, name, row, None)
-    except (KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
-        raise CalibrationError(f"{where}: its camera cannot be read ({error})") from None
 
 
 def _choose(keys: list[str], peaks: list[PeakFrame], in_clip: bool, where: str) -> dict[str, str]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from express50.errors import FormatError, StageError
 from express50.files.images import srgb_to_linear
-from express50.files.text import read_json, read_text, reason
+from express50.files.text import MALFORMED, read_json, read_text, refusing
 from express50.geometry.meshes import check_faces
 from express50.geometry.transforms import similarity_fit
 
@@ -128,7 +128,8 @@ def read_landmarks(path: Path) -> np.ndarray:
     Raises:
         FormatError: the layout, the number of points, a name or a coordinate is wrong.
     """
-    try:
+    what = f"{path}: cannot be read as landmarks of a scan"
+    with refusing(FormatError, what, _FIX, (*MALFORMED, ElementTree.ParseError)):
         rows = _read_rows(path)
         points = np.full((68, 3), np.nan)
         for place, (name, xyz) in zip(_places([name for name, _ in rows]), rows, strict=True):
@@ -140,10 +141,6 @@ def read_landmarks(path: Path) -> np.ndarray:
             if np.isfinite(points[place]).all():
                 raise ValueError(f"point {name} appears twice")
             points[place] = xyz
-    except (ValueError, ArithmeticError, TypeError, LookupError, ElementTree.ParseError) as error:
-        raise FormatError(
-            f"{path}: cannot be read as landmarks of a scan ({reason(error)}); {_FIX}"
-        ) from None
     return points
 
 
