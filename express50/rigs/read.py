@@ -27,7 +27,6 @@ from express50.rigs.camera_builder import (
     in_metres,
     size_from,
 )
-from express50.rigs.colmap import is_colmap, read_colmap_images
 from express50.rigs.other_tools import (
     read_calibration_toml,
     read_facescape,
@@ -41,7 +40,12 @@ from express50.rigs.other_tools import (
     read_renderme,
     read_vggt,
 )
-from express50.rigs.transforms_json import is_transforms, read_transforms
+from express50.rigs.per_picture import (
+    is_colmap,
+    is_transforms,
+    read_colmap_images,
+    read_transforms,
+)
 
 # Names in use: OpenCV's calibration sample, its stereo sample, ROS, and hand-written files.
 _K = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsics")

@@ -34,8 +34,8 @@ from express50.geometry.transforms import (
 )
 from express50.head.load import load_head
 from express50.head.model import HeadModel, pose, rest_vertices
+from express50.rigs.per_picture import frame_camera
 from express50.rigs.read import read_rig
-from express50.rigs.transforms_json import frame_camera
 from pipelines.imports.pictures import PeakFrame, fill
 
 WHAT = "FLAME parameters of a tracker"

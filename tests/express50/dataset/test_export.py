@@ -19,7 +19,7 @@ from express50.dataset.export_avatar import centred
 from express50.files.calibration import read_cameras, write_cameras
 from express50.files.images import read_alpha, read_image, srgb_to_linear, write_image
 from express50.head.load import load_head
-from express50.rigs.transforms_json import read_transforms
+from express50.rigs.per_picture import read_transforms
 from tests.express50.dataset.tracked import track_arrays, world_vertices, write_track
 from tests.express50.head.flame_files import write_flame
 from tests.express50.head.flame_reader import flame_vertices
