@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -52,6 +53,7 @@ class Network:
     role: Role
     size: tuple[int, int] | None
     run: Run
+    errors: tuple[type[BaseException], ...]  # what `run` raises if the network fails
 
     def __call__(self, *pictures: np.ndarray) -> np.ndarray:
         """Answer (C, H', W') float32 to pictures (H, W, 3) float32.
@@ -60,7 +62,11 @@ class Network:
             StageError: the network failed, or answered with another shape or NaN or Inf.
         """
         batches = [np.ascontiguousarray(p.transpose(2, 0, 1)[None], np.float32) for p in pictures]
-        answer = self.run(batches)[self.role.place]
+        try:
+            answer = self.run(batches)[self.role.place]
+        except self.errors as error:
+            shape = tuple(batches[0].shape)
+            raise self.error(f"failed on input {shape} ({_reason(error)})") from None
         shape = tuple(answer.shape)
         if len(shape) == 3 and shape[0] == 1:  # some exports drop the channel
             answer = answer[None]
@@ -136,8 +142,8 @@ def _torchscript(path: Path, role: Role) -> Network:
         module.refine_mode = "thresholding"
     if device.type == "cpu":
         module = module.float()  # few operators work in half precision there
-
-    return Network(path, role, None, lambda b: _run_torchscript(path, role, module, device, b))
+    run = partial(_run_torchscript, path, role, module, device)
+    return Network(path, role, None, run, TORCH_ERRORS)
 
 
 def _run_torchscript(
@@ -157,11 +163,7 @@ def _run_torchscript(
         if cuda and dtype == torch.float32:
             stack.enter_context(torch.autocast("cuda", torch.float16))
         torch.manual_seed(0)
-        try:
-            answer = module(*(torch.from_numpy(b).to(device, dtype) for b in batches))
-        except TORCH_ERRORS as error:
-            shape = tuple(batches[0].shape)
-            raise _error(path, role, f"failed on input {shape} ({_reason(error)})") from None
+        answer = module(*(torch.from_numpy(b).to(device, dtype) for b in batches))
         if isinstance(answer, torch.Tensor):
             answer = [answer]
         if not isinstance(answer, list | tuple) or not answer:
@@ -216,15 +218,11 @@ def _onnx(path: Path, role: Role) -> Network:
             slot.name: batch.astype(np.float16 if "float16" in slot.type else np.float32)
             for slot, batch in zip(slots, batches, strict=True)
         }
-        try:
-            return [np.asarray(session.run(wanted[:1], given)[0], np.float32)]
-        except errors as error:
-            shape = tuple(batches[0].shape)
-            raise _error(path, role, f"failed on input {shape} ({_reason(error)})") from None
+        return [np.asarray(session.run(wanted[:1], given)[0], np.float32)]
 
     height, width = [*slots[0].shape, None, None, None, None][2:4]
     fixed = isinstance(height, int) and isinstance(width, int)
-    return Network(path, role, (height, width) if fixed else None, run)
+    return Network(path, role, (height, width) if fixed else None, run, errors)
 
 
 SAPIENS = Role(setting="regions.segmentation", inputs=("image",))

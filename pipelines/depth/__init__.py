@@ -71,8 +71,7 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
     """Reconstruct one expression."""
     from pipelines.depth.stage import run as work
 
-    fineness = config.voxel_mm, config.voxel_px, config.noise
-    return work(dataset, item, out, side=config.image_side, fineness=fineness)
+    return work(dataset, item, out, **vars(config))
 
 
 STAGE = Stage(

@@ -46,17 +46,16 @@ AGREEMENT = 0.85  # share of the tracked mesh that must lie in the mattes for it
 
 
 def run(
-    dataset: Dataset, item: str, out: Path, *, side: int, fineness: tuple[float, float, float]
-) -> Result:
+    dataset: Dataset, item: str, out: Path, *, voxel_mm: float, voxel_px: float, image_side: int,
+    noise: float,
+) -> Result:  # fmt: skip
     """Write every camera's maps, the coloured surface and a contact sheet.
-
-    `side` is `depth.image_side`; `fineness` are `depth.voxel_mm`, `voxel_px` and `noise`.
 
     Raises:
         StageError: there are too few usable views, or one view without a tracked head.
     """
     cv2.setNumThreads(1)  # the runner counts one core per item
-    views, pictures, dropped = read_views(dataset, item, side)
+    views, pictures, dropped = read_views(dataset, item, image_side)
     # One camera of which nothing was dropped is a photograph, or a video.
     if not views or (len(views) == 1 and dropped):
         why, least = "; ".join(map(str, dropped)), 1 if len(dropped) == 1 and not views else 2
@@ -67,9 +66,9 @@ def run(
         )
     views, solid, track = read_tracked(dataset, item, views)
     if len(views) > 1:
-        surface = reconstruct(views, solid, *fineness)
+        surface = reconstruct(views, solid, voxel_mm, voxel_px, noise)
     elif solid is not None:
-        surface = tracked_surface(views[0], solid, *fineness)
+        surface = tracked_surface(views[0], solid, voxel_mm, voxel_px, noise)
     else:
         raise StageError(
             f"{item}: with one camera, depth is that of the tracked head, which was not used"

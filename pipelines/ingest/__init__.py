@@ -71,11 +71,7 @@ def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result:
     """Make one item, see `pipelines.ingest.stage`."""
     from pipelines.ingest.stage import run as work
 
-    return work(
-        dataset, item, out, proxy=(config.proxy_long_side, config.proxy_quality),
-        every=config.every, sync_frames=config.sync_frames, focus_every=config.focus_every,
-        blur_ratio=config.blur_ratio,
-    )  # fmt: skip
+    return work(dataset, item, out, **vars(config))
 
 
 def account(dataset: Dataset, subjects: Sequence[str]) -> Iterator[str]:

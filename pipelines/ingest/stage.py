@@ -150,27 +150,17 @@ def _capture_of(dataset: Dataset, item: str) -> Path:
 
 
 def run(
-    dataset: Dataset,
-    item: str,
-    out: Path,
-    *,
-    proxy: tuple[int, int],
-    every: int,
-    sync_frames: int,
-    focus_every: int,
-    blur_ratio: float,
-) -> Result:
-    """Index one capture; an unusable camera is dropped with its reason.
-
-    ``proxy`` is the longer side and the JPEG quality of proxies. Of ``every`` frames one is
-    decoded.
-    """
+    dataset: Dataset, item: str, out: Path, *, proxy_long_side: int, proxy_quality: int, every: int,
+    sync_frames: int, focus_every: int, blur_ratio: float,
+) -> Result:  # fmt: skip
+    """Index one capture; an unusable camera is dropped with its reason."""
     raw = read_any(_capture_of(dataset, item))
     if raw.subject != item:
         raise CaptureError(f"{raw.root / 'capture.toml'}: {_renamed(dataset, item, raw.subject)}")
     check_focals(raw.root / "capture.toml", raw.meta.get("focal_px", {}))
     check_sample_names(raw)
     (out / "proxies").mkdir()
+    proxy = proxy_long_side, proxy_quality
     cameras, measured, dropped = _scan(raw, out / "proxies", proxy, every, focus_every)
     calibration = _calibration(raw, cameras)
     raw, outside = _with_cues(raw, cameras, measured, dropped, out / "proxies")

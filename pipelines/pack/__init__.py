@@ -78,11 +78,7 @@ def encode_run(dataset: Dataset, item: str, config: EncodeConfig, out: Path) -> 
     """Write the subject's samples as shards with index and manifest."""
     from pipelines.pack.stage import encode
 
-    return encode(
-        dataset, item, out, size=config.size, profile=config.profile,
-        even_colour=config.even_colour, remove_torso=config.torso == "remove",
-        min_confidence=config.min_confidence,
-    )  # fmt: skip
+    return encode(dataset, item, out, **vars(config))
 
 
 def items(dataset: Dataset) -> list[str]:
@@ -113,7 +109,7 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result:
     """Gather the shards, and write index, manifest, splits and card."""
     from pipelines.pack.stage import pack
 
-    return pack(dataset, out, config.test_subjects, config.test_fraction)
+    return pack(dataset, out, **vars(config))
 
 
 def account(dataset: Dataset, items: Sequence[str]) -> Iterator[str]:

@@ -32,7 +32,7 @@ ON_CARD = ("subject", "expression", "camera", "label", "licence", "consent", "he
 
 def encode(
     dataset: Dataset, name: str, out: Path, *, size: int, profile: str, even_colour: bool,
-    remove_torso: bool, min_confidence: float,
+    torso: str, min_confidence: float,
 ) -> Result:  # fmt: skip
     """Write one subject's shards, index and manifest.
 
@@ -53,7 +53,7 @@ def encode(
         for camera_id, camera in sorted(subject.cameras.items()):
             try:
                 loaded = load_sample(
-                    dataset, subject, expression, camera, remove_torso, min_confidence
+                    dataset, subject, expression, camera, torso == "remove", min_confidence
                 )
                 sample, meta = encode_sample(loaded, subject, expression, camera, size, profile)
             except (CaptureError, FormatError, StageError) as error:

@@ -18,7 +18,7 @@ from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import ExpectedError, Note, Result
-from express50.dataset.tracks import LARGEST_SPREAD, shape_spread
+from express50.dataset.tracks import LARGEST_SPREAD, SCHEMA, shape_spread
 from express50.error_model import Bounds, error_bounds, error_models, expect, single_camera_sigma
 from express50.errors import StageError
 from express50.files.digests import path_digest, value_digest
@@ -56,7 +56,6 @@ from pipelines.track.state import (
 )
 from pipelines.track.terms import Term
 
-SCHEMA = "express50.track/2"
 # Number of modes along the skin (for each of three axes) per mode along the normals: texture
 # locates the skin less finely than patches do.
 ALONG_SHARE = 4 / 15

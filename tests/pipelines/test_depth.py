@@ -15,6 +15,7 @@ from express50.errors import StageError
 from express50.geometry.cameras import rays, unproject
 from express50.geometry.raycast import mesh_scene
 from express50.head.load import HeadTopology
+from pipelines.depth import DepthConfig
 from pipelines.depth.blocks import build
 from pipelines.depth.maps import cast_maps, picture_of, surface_maps
 from pipelines.depth.prior import (
@@ -255,7 +256,7 @@ def test_a_photograph_without_a_matte_is_not_asked_for_two_cameras(lacking, leas
     monkeypatch.setattr("pipelines.depth.stage.read_views", lambda *given: ([], [], notes))
     words = f"0 cameras with a matte of the head, expected at least {least} .*'express50 matte d'"
     with pytest.raises(StageError, match=words):
-        run(Dataset(Path("d")), "S001/photo", Path("out"), side=64, fineness=(4, 1, 1))
+        run(Dataset(Path("d")), "S001/photo", Path("out"), **vars(DepthConfig(image_side=64)))
 
 
 def test_unusable_mattes_are_refused(shots):
