@@ -33,7 +33,7 @@ from express50.files.images import encode_png, read_image
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.meshes import encode_glb, split_seams, write_obj, write_ply
 from express50.head.load import load_head
-from express50.head.model import HeadModel, pose
+from express50.head.model import HeadModel, normals_of, pose
 
 META = "export.json"
 TEXTURE = "albedo.png"
@@ -220,6 +220,7 @@ def export_meshes(head: Head, kind: str, out: Path) -> dict:
                 "head",
                 vertices[places],
                 corners,
+                normals=normals_of(vertices, faces)[places],  # viewers show flat facets without
                 uv=model.uv.numpy()[uv_places],
                 baseColorTexture=None if head.albedo is None else Image.fromarray(head.albedo),
                 baseColorFactor=[190 if head.albedo is None else 255] * 3 + [255],
