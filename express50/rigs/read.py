@@ -40,12 +40,7 @@ from express50.rigs.other_tools import (
     read_renderme,
     read_vggt,
 )
-from express50.rigs.per_picture import (
-    is_colmap,
-    is_transforms,
-    read_colmap_images,
-    read_transforms,
-)
+from express50.rigs.per_picture import is_colmap, is_transforms, read_colmap_images, read_transforms
 
 # Names in use: OpenCV's calibration sample, its stereo sample, ROS, and hand-written files.
 _K = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsics")

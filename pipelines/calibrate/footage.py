@@ -92,9 +92,8 @@ def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Ima
 def read_raw_footage(root: Path, cameras: Mapping[str, Camera], count: int) -> Images:
     """Yield reduced images of a capture of any layout at up to `count` instants.
 
-    They are chosen as `read_footage` does.
-
-    Only the first frame of a video without cues is read, because its length is unknown.
+    These are the middles of cues, or spread over all frames where there are no cues. Only the first
+    frame of a video without cues is read, because its length is unknown.
 
     Raises:
         CaptureError: the capture is unusable, or a camera has no such frame.

@@ -209,13 +209,13 @@ def replaced(grid: LevelSet, places: np.ndarray, values: Values) -> LevelSet:
     return assemble(grid.origin, grid.voxel, grid.shape, inside, places, values)
 
 
-def windows(grid: LevelSet, places: np.ndarray, before: int, after: int) -> np.ndarray:
-    """Take blocks at places (M, 3) with voxels of their neighbours around: (M, S, S, S)."""
-    side = before + BLOCK + after
+def windows(grid: LevelSet, places: np.ndarray, before: int) -> np.ndarray:
+    """Take blocks at places (M, 3) with `before` voxels before and one after: (M, S, S, S)."""
+    side = before + BLOCK + 1
     out = np.empty((len(places), side, side, side), grid.blocks.dtype)
     spans = ((-1, slice(BLOCK - before, BLOCK), slice(0, before)),
              (0, slice(0, BLOCK), slice(before, before + BLOCK)),
-             (1, slice(0, after), slice(before + BLOCK, side)))  # fmt: skip
+             (1, slice(0, 1), slice(before + BLOCK, side)))  # fmt: skip
     padded = np.pad(grid.table, 1)  # beyond the box is outside
     for x, y, z in product([span for span in spans if span[1] != slice(BLOCK, BLOCK)], repeat=3):
         rows = padded[tuple((places + [1 + x[0], 1 + y[0], 1 + z[0]]).T)]

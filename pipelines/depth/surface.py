@@ -74,7 +74,7 @@ def extract_mesh(grid: LevelSet) -> HeadMesh:
     # In a cube, not in a row: the vertices' indices are float32.
     tile, tiles = BLOCK + 1, math.ceil(len(places) ** (1 / 3))
     volume = np.ones((tiles**3, tile, tile, tile), np.float32)
-    values, least = windows(grid, places, 0, 1), np.float32(LEAST_VOXELS * grid.voxel)
+    values, least = windows(grid, places, 0), np.float32(LEAST_VOXELS * grid.voxel)
     # Away from 0, so that each vertex lies clearly on one edge.
     volume[: len(places)] = np.where(np.abs(values) < least, np.copysign(least, values), values)
     volume = volume.reshape(tiles, tiles, tiles, tile, tile, tile).transpose(0, 3, 1, 4, 2, 5)
@@ -250,7 +250,7 @@ def fair(grid: LevelSet, sigma: float) -> LevelSet:
     smooth = smoothed(grid, sigma / grid.voxel)
 
     def values(places: np.ndarray) -> np.ndarray:
-        own, around = at(grid, places), windows(smooth, places, 1, 1)
+        own, around = at(grid, places), windows(smooth, places, 1)
         steps = np.gradient(around, grid.voxel, axis=(1, 2, 3))
         slope = np.sqrt(sum(g * g for g in steps))[:, 1:-1, 1:-1, 1:-1]
         smoothest = around[:, 1:-1, 1:-1, 1:-1] / np.clip(slope, 0.4, 2.0)

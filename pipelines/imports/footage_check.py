@@ -16,6 +16,7 @@ from express50.errors import CaptureError, StageError
 from express50.files.images import disc
 from express50.geometry.cameras import Camera, inside_frame, project_pinhole
 from express50.landmarks import EMBEDDED
+from pipelines.calibrate.footage_rig import INNER
 from pipelines.imports.pictures import PeakFrame, pixels_showing
 from pipelines.track.observe import Observation
 from pipelines.track.read_inputs import agreed, open_landmarks, search_views
@@ -31,7 +32,6 @@ LEAST_MARKS = 8
 DEPTH_OFF_M = 0.008
 SEARCH = 0.25  # smallest window searched for a face, as in tracking
 NO_FACE = "the footage shows no face on which two cameras agree, so nothing was compared to it"
-INNER = slice(17, 68)  # landmarks that are not on the jaw's outline
 
 
 def observe_peak(

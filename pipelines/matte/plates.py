@@ -419,6 +419,12 @@ def to_light(values: np.ndarray) -> np.ndarray:
     return srgb_to_linear(np.clip(values, 0, 255) / 255.0).astype(np.float32)
 
 
+def light_per_step(values: np.ndarray) -> np.ndarray:
+    """Return how much linear light changes per 8-bit step at sRGB values in such steps."""
+    level = np.clip(values, 1, 254)
+    return (to_light(level + 1) - to_light(level - 1)) / 2
+
+
 def darkening(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Return logarithms (..., 3) of an image's light over its plate's; both are sRGB values."""
     return np.log((to_light(image) + DARK) / (to_light(plate) + DARK))
@@ -426,9 +432,7 @@ def darkening(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
 
 def light_noise(plate: np.ndarray, sigma: np.ndarray, whiten: np.ndarray) -> np.ndarray:
     """Return the covariance (N, 3, 3) of light from that of 8-bit steps at plate values (N, 3)."""
-    level = np.clip(plate, 1, 254)
-    slope = (to_light(level + 1) - to_light(level - 1)) / 2
-    deviation = slope * sigma
+    deviation = light_per_step(plate) * sigma
     mixing = np.linalg.inv(whiten.astype(np.float64))
     mixed = (mixing @ mixing.T).astype(np.float32)
     return deviation[:, :, None] * mixed * deviation[:, None, :]

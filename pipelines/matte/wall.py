@@ -22,25 +22,15 @@ import numpy as np
 from express50.capture.frames import read_written
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError, NoFaceError
-from express50.files.images import (
-    edge_distance,
-    shrink,
-)
+from express50.files.images import edge_distance, shrink
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import undistorted_mask
-from pipelines.matte.cutout import (
-    FACES,
-    Cut,
-    CutView,
-    HeadPlace,
-    cut_out,
-    find_head,
-    make_cut_view,
-)
+from pipelines.matte.cutout import FACES, Cut, CutView, HeadPlace, cut_out, find_head, make_cut_view
 from pipelines.matte.plates import (
     LEAST_SHARE,
     exposed,
     exposure_gain,
+    light_per_step,
     local_colours,
     nearest_first,
     open_share,
@@ -290,8 +280,7 @@ def _posterior(
     light, behind = to_light(image), to_light(wall)[band]
     rim = (valid & (depth > RIM_M[0]) & (depth < RIM_M[1])).astype(np.float32)
     mean, covariance = local_colours(light, rim, band, REACH_M * density, SPREAD)
-    level = np.clip(wall[band], 1, 254)
-    slope = (to_light(level + 1) - to_light(level - 1)) / 2
+    slope = light_per_step(wall[band])
     own, error = (NOISE * slope) ** 2, (wall_error[band] * slope) ** 2
     inside = np.clip(1 / (1 + np.exp(-depth[band] / DOUBT_M)), ODD, 1 - ODD)
     soft = MIXED * np.exp(-np.abs(depth[band]) / (4 * DOUBT_M)) + ODD

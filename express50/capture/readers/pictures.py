@@ -25,12 +25,7 @@ from express50.files.containers import inside
 from express50.files.text import read_json_table, unreadable
 from express50.geometry.cameras import Camera
 from express50.rigs.camera_builder import in_metres
-from express50.rigs.per_picture import (
-    camera_names,
-    is_colmap,
-    read_colmap_images,
-    read_transforms,
-)
+from express50.rigs.per_picture import camera_names, is_colmap, read_colmap_images, read_transforms
 
 MODELS = ("sparse/0", "sparse", ".")
 MOMENT = "photo"
