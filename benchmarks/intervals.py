@@ -37,12 +37,12 @@ from benchmarks.intervals_collect import (
     sampled,
     with_tracked,
 )
-from benchmarks.intervals_fit import ause, fit_items, fit_model
+from benchmarks.intervals_fit import NOMINAL, ause, fit_items, fit_model
 from benchmarks.intervals_rows import ALIGN_NOISE, CONDITIONS, make_peaks, make_row
 from benchmarks.truth import Truth
 from express50.contract.layout import Dataset
 from express50.contract.stage import Unit
-from express50.error_model import FILE, NOMINAL, ErrorModel, error_bounds, error_models, item_error
+from express50.error_model import FILE, ErrorModel, error_bounds, error_models, item_error
 from express50.errors import CalibrationError
 from express50.files.atomic import dump_json
 from express50.rigs.world_frame import meeting_point

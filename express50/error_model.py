@@ -22,7 +22,6 @@ from express50.contract.stage import ExpectedError, Unit
 from express50.geometry.cameras import Camera
 
 FILE = Path(__file__).with_name("error_models.json")
-NOMINAL = 0.9  # share of the true errors that bounds and intervals should contain
 HEAD_SIZE_SPREAD = 0.04  # standard deviation of heads' size, as a share
 # Percentiles of |x| for a standard normal x: 50th and 90th; 5th, 50th and 95th.
 HALF, NINE_IN_TEN = 0.674, 1.645

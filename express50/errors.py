@@ -65,6 +65,10 @@ class StageError(Express50Error):
     """A stage cannot process one of its items."""
 
 
+UNREADABLE = CaptureError, FormatError, StageError
+"""What reading a view's pictures raises; stages leave the view out, name it, and go on."""
+
+
 class NoFaceError(StageError):
     """A picture shows no face where one is needed."""
 

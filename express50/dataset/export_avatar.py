@@ -24,7 +24,7 @@ from express50.capture.frames import read_cameras_of, read_gains, read_matte, re
 from express50.contract.layout import Dataset
 from express50.dataset.export import META, Head, write_head_obj
 from express50.dataset.tracks import Track
-from express50.errors import CaptureError, ConfigError, FormatError, StageError, check_known
+from express50.errors import UNREADABLE, ConfigError, StageError, check_known
 from express50.files.atomic import dump_json
 from express50.files.images import encode_png, resize_area, scale_light
 from express50.geometry.cameras import Camera, pinhole_camera, scale_camera, transform_camera
@@ -89,7 +89,7 @@ def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Pat
             file, item = f"{step}_{number:02d}.png", f"{head.subject}/{name}"
             try:
                 _write_view(dataset, item, camera, targets[camera_id], options, out, file)
-            except (CaptureError, FormatError, StageError) as error:
+            except UNREADABLE as error:
                 dropped.append({"what": f"{name}/{camera_id}", "why": str(error)})
                 continue
             ids = {"timestep_index": len(steps), "timestep_index_original": frame,

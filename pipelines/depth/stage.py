@@ -16,7 +16,7 @@ from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import encode_depth, encode_normals, write_depth
 from express50.dataset.tracks import read_track
 from express50.error_model import error_models, expect, single_camera_sigma
-from express50.errors import CaptureError, FormatError, StageError, advised
+from express50.errors import UNREADABLE, StageError, advised
 from express50.files.images import contact_sheet, shrink, srgb_to_linear, write_image
 from express50.geometry.meshes import encode_glb, write_surface
 from express50.geometry.sampling import evenly
@@ -121,7 +121,7 @@ def read_views(
             rgb, alpha = read_matted_frame(dataset, item, camera)
             views.append(make_view(camera, rgb, cv2.LUT(alpha, SHARE_OF_LEVEL), image_side))
             pictures.append(picture_of(camera, rgb, alpha))
-        except (CaptureError, FormatError, StageError) as error:
+        except UNREADABLE as error:
             dropped.append(Note(camera_id, str(error)))
     views, contradicting = without_contradiction(views)
     gone = {note.what for note in contradicting}

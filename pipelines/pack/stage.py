@@ -17,7 +17,7 @@ from express50.capture.readers.read import read_people
 from express50.console import count
 from express50.contract.layout import Dataset, exclusion_reason
 from express50.contract.stage import Note, Result
-from express50.errors import CaptureError, FormatError, StageError, advised, few
+from express50.errors import UNREADABLE, FormatError, StageError, advised, few
 from express50.files.atomic import write_json
 from express50.files.images import contact_sheet, write_image
 from express50.files.text import read_json_table
@@ -56,7 +56,7 @@ def encode(
                     dataset, subject, expression, camera, torso == "remove", min_confidence
                 )
                 sample, meta = encode_sample(loaded, subject, expression, camera, size, profile)
-            except (CaptureError, FormatError, StageError) as error:
+            except UNREADABLE as error:
                 dropped.append(Note(f"{name}/{expression}/{camera_id}", str(error)))
                 continue
             group.append(sample)

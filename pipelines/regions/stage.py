@@ -15,7 +15,7 @@ from express50.contract.segmentation_labels import COLOURS, LABELS
 from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import existing_track, read_track
-from express50.errors import CaptureError, FormatError, StageError, advised
+from express50.errors import UNREADABLE, FormatError, StageError, advised
 from express50.files.images import box_about, contact_sheet, fit_into, write_image
 from express50.geometry.cameras import Camera, cut_about, project
 from express50.geometry.sampling import evenly
@@ -53,7 +53,6 @@ AGREEMENT = 0.85  # a camera with less of the tracked mesh inside its matte gets
 SHOWN = 4  # cameras in the contact sheet
 MARGIN = 32  # pixels about the subject: the discs that find hands and glasses are smaller
 TILE = (260, 260)
-UNREADABLE = (CaptureError, FormatError, StageError)
 
 Frames = dict[str, tuple[np.ndarray, np.ndarray]]
 """Frames (H, W, 3) uint8 and mattes (H, W) float32 by camera."""
