@@ -177,7 +177,7 @@ def draw_person(model: HeadModel, uv_map: FaceUvMap, rng: Rng) -> PaintedHead:
 
 
 def draw_case(model: HeadModel, uv_map: FaceUvMap, person: PaintedHead, rng: Rng) -> Case:
-    """Let a person act, look from some cameras and read the uv_map of a mesh that is off."""
+    """Let a person act, look from some cameras, and read the map of a mesh that is off."""
     true, wrong = draw_meshes(model, uv_map, rng)
     lamps = draw_lamps(rng)
     head = _PaintedScene(model, uv_map, person, true, lamps, rng)
