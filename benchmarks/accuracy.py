@@ -26,8 +26,9 @@ from express50.contract.segmentation_labels import COLOURS
 from express50.dataset.depth_files import depth_file, read_depth, read_normals
 from express50.dataset.tracks import read_track
 from express50.errors import Express50Error
-from express50.files.images import contact_sheet, read_image, write_image
+from express50.files.images import read_image, write_image
 from express50.geometry.cameras import Camera, pinhole, transform_camera
+from express50.geometry.pixels import contact_sheet
 from express50.geometry.transforms import transform_points
 
 VIEWS_PER_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from express50.files.images import box_about
 from express50.geometry.cameras import Camera, depth_in
 from express50.geometry.conventions import K_to_opencv
+from express50.geometry.pixels import box_about
 from pipelines.depth.views import INSIDE, DepthView, head_box
 from pipelines.imports.pictures import fuse
 

@@ -24,9 +24,10 @@ from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import read_registration, read_track
 from express50.error_model import HEAD_SIZE_SPREAD, ErrorModel, error_bounds, single_camera_sigma
-from express50.files.images import read_alpha, shrink
+from express50.files.images import read_alpha
 from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.meshes import read_surface
+from express50.geometry.pixels import shrink
 from express50.geometry.transforms import transform_points
 from express50.head.load import load_head
 from pipelines.depth.maps import picture_of, surface_maps

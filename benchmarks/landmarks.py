@@ -27,7 +27,8 @@ import numpy as np
 import torch
 
 from benchmarks.common import make_parser
-from express50.files.images import contact_sheet, write_image
+from express50.files.images import write_image
+from express50.geometry.pixels import contact_sheet
 from express50.head.load import load_head
 from express50.landmarks import WEIGHTS
 from express50.landmarks.detector import detect, detect_many

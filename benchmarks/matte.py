@@ -34,7 +34,7 @@ from benchmarks.common import make_parser, means, recorded, rounded, true_pictur
 from benchmarks.matte_scenes import Scene, make_scenes
 from benchmarks.truth import Truth
 from express50.contract.layout import Dataset
-from express50.files.images import srgb_to_linear
+from express50.geometry.pixels import srgb_to_linear
 from express50.geometry.sampling import evenly
 from express50.twin import TwinConfig
 from pipelines.matte import MatteConfig

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from benchmarks.matte_scenes import cluttered, exposed, noisy, srgb8
-from express50.files.images import srgb_to_linear
 from express50.geometry.cameras import Camera, pinhole, rays
+from express50.geometry.pixels import srgb_to_linear
 
 SHADE = 0.5  # share of linear light that the shadow takes; the key forgives a quarter
 STAND = (0.06, 0.07, 0.05)  # linear light of the object

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.files.images import linear_to_srgb, srgb_to_linear
+from express50.geometry.pixels import linear_to_srgb, srgb_to_linear
 
 FINE = 8  # samples per pixel and axis
 SHADES = 24  # of hair

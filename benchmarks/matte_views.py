@@ -59,8 +59,9 @@ from benchmarks.matte_disturbances import DISTURBANCES, Shot, other_plates, wall
 from benchmarks.truth import Truth
 from express50.contract.layout import Dataset
 from express50.errors import NoFaceError
-from express50.files.images import contact_sheet, shrink, write_image
+from express50.files.images import write_image
 from express50.geometry.cameras import pinhole
+from express50.geometry.pixels import contact_sheet, shrink
 from express50.geometry.sampling import evenly
 from express50.twin import TwinConfig
 from pipelines.matte import MatteConfig

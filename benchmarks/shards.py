@@ -26,7 +26,7 @@ import numpy as np
 from skimage.data import astronaut
 
 from benchmarks.common import make_parser
-from express50.files.images import resize_area
+from express50.geometry.pixels import resize_area
 from express50.runner.worker import cap_threads, core_seconds
 from express50.shards.codecs import (
     ALPHA,

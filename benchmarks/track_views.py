@@ -21,8 +21,8 @@ from express50.capture.frames import FootageReader, read_cameras_of
 from express50.capture.raw import read_capture
 from express50.contract.layout import Dataset
 from express50.files.containers import read_picture
-from express50.files.images import LIGHT_OF_LEVEL, linear_to_srgb
 from express50.geometry.cameras import Camera, pinhole, unproject
+from express50.geometry.pixels import LIGHT_OF_LEVEL, linear_to_srgb
 from express50.geometry.raycast import visible_faces
 from express50.geometry.sampling import undistort_image
 from express50.geometry.transforms import unit

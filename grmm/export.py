@@ -26,8 +26,8 @@ from scipy.ndimage import distance_transform_edt
 
 from express50.errors import ConfigError
 from express50.files.atomic import write_bytes
-from express50.files.images import srgb_to_linear
 from express50.geometry.meshes import encode_glb, split_seams
+from express50.geometry.pixels import srgb_to_linear
 from express50.geometry.shapes import check_finite
 from express50.head.model import HeadModel, normals_of
 from grmm.checkpoint import Checkpoint

@@ -16,8 +16,9 @@ from torch import Tensor
 from express50.console import log
 from express50.dataset import tracks
 from express50.errors import ConfigError, check_known
-from express50.files.images import contact_sheet, write_image
+from express50.files.images import write_image
 from express50.files.video import BT601, LIMITED
+from express50.geometry.pixels import contact_sheet
 from grmm.checkpoint import Checkpoint
 from grmm.data import HeadViews, stacked
 from grmm.edit import (

@@ -26,8 +26,8 @@ from express50.contract.segmentation_labels import LABELS, label_mask
 from express50.errors import ConfigError, StageError
 from express50.files.arrays import DAMAGE
 from express50.files.digests import cached_by_file
-from express50.files.images import resize_area
 from express50.files.text import expanded, no_file
+from express50.geometry.pixels import resize_area
 
 TORCH_ERRORS = (*DAMAGE, torch.jit.Error)
 

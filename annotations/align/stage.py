@@ -32,7 +32,8 @@ from express50.contract.stage import ExpectedError, Note, Result
 from express50.error_model import error_bounds
 from express50.errors import StageError, advised
 from express50.files.atomic import write_json
-from express50.files.images import contact_sheet, write_image
+from express50.files.images import write_image
+from express50.geometry.pixels import contact_sheet
 
 
 def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -> Result:

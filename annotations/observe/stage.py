@@ -23,8 +23,9 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.errors import FormatError, StageError, advised, rounded_down
 from express50.files.arrays import read_arrays
-from express50.files.images import contact_sheet, write_image
+from express50.files.images import write_image
 from express50.files.text import refusing
+from express50.geometry.pixels import contact_sheet
 from express50.geometry.transforms import scale_of, similarity_fit, transform_points
 
 if TYPE_CHECKING:

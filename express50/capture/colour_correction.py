@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.files.images import LIGHT_OF_LEVEL, linear_to_srgb
+from express50.geometry.pixels import LIGHT_OF_LEVEL, linear_to_srgb
 
 _SQUARES = ("RR", "GG", "BB")
 _PRODUCTS = ("RG", "RB", "GB")

@@ -31,17 +31,11 @@ from express50.errors import CaptureError, FormatError, StageError, advised, che
 from express50.files.calibration import read_cameras
 from express50.files.containers import inside, read_picture, read_srgb
 from express50.files.digests import cached_by_file
-from express50.files.images import (
-    decode_image,
-    read_alpha,
-    read_image,
-    reduce_light,
-    shrink,
-    upright,
-)
+from express50.files.images import decode_image, read_alpha, read_image, upright
 from express50.files.text import read_json, read_json_table, refusing
 from express50.files.video import VideoReader
 from express50.geometry.cameras import Camera, pinhole, resized
+from express50.geometry.pixels import reduce_light, shrink
 from express50.geometry.sampling import undistort_image
 
 STRIP = 64  # rows that `write_frame` compresses together

@@ -26,9 +26,10 @@ from express50.dataset.export import META, Head, write_head_obj
 from express50.dataset.tracks import Track
 from express50.errors import UNREADABLE, ConfigError, StageError, check_known
 from express50.files.atomic import dump_json
-from express50.files.images import encode_png, resize_area, scale_light
+from express50.files.images import encode_png
 from express50.geometry.cameras import Camera, pinhole_camera, scale_camera, transform_camera
 from express50.geometry.conventions import affine_to_opencv, opengl_from_cam_from_world
+from express50.geometry.pixels import resize_area, scale_light
 from express50.geometry.transforms import make_transform, matrix_to_axis_angle
 from express50.head.model import HeadModel, rest_vertices
 from express50.head.mouth import FLAME_VERTICES as BARE_VERTICES

@@ -16,8 +16,9 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import stages, typical_error
 from express50.errors import CaptureError, FormatError
 from express50.files.containers import read_srgb
-from express50.files.images import encode_jpeg, resize_area
+from express50.files.images import encode_jpeg
 from express50.files.text import is_number, parse_json, read_json_table, read_text
+from express50.geometry.pixels import resize_area
 from express50.geometry.sampling import evenly
 from express50.runner.ledger import Ledger, Receipt
 

@@ -21,8 +21,9 @@ from express50.contract.layout import Dataset
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import read_registration, read_track
 from express50.errors import Express50Error, FormatError
-from express50.files.images import read_image, resize_area
+from express50.files.images import read_image
 from express50.files.text import read_json_table
+from express50.geometry.pixels import resize_area
 from express50.geometry.transforms import rigid_fit
 from express50.head.load import load_head
 from express50.head.model import vertex_normals

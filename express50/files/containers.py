@@ -22,8 +22,9 @@ from PIL import Image
 from express50.errors import CaptureError, FormatError
 from express50.files.arrays import DAMAGE as ARRAY_DAMAGE
 from express50.files.digests import cached_by_file
-from express50.files.images import decode_cv, linear_to_srgb, read_image, upright
+from express50.files.images import decode_cv, read_image, upright
 from express50.files.text import check_readable, read_bytes, refusing
+from express50.geometry.pixels import linear_to_srgb
 from express50.geometry.shapes import PIXEL_LIMIT
 
 WITHIN = "!/"

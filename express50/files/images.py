@@ -1,4 +1,4 @@
-"""Read, write, encode and decode images; convert colour and depth; lay out contact sheets.
+"""Read, write, encode and decode images; quantise depth.
 
 OpenImageIO reads files with 8 and 16 bits, half and single floats, and encodes TIFF and EXR;
 imagecodecs reads PNG twice as fast; OpenCV decodes bytes in memory and encodes JPEG. Images are RGB
@@ -11,7 +11,7 @@ import math
 import mmap
 import os
 import struct
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,7 +38,6 @@ PHOTOMETRIC = (0, 1, 2, 3, 6)
 JPEG_SIDE, PNG_SIDE = 65500, 1_000_000  # pixels; encoder and decoder refuse longer sides
 PNG_START = b"\x89PNG\r\n\x1a\n"
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
-TINT = 0.02  # mean difference of a grey picture's channels, as a share of its brightness
 SRGB_SLACK = 2  # of 255 levels by which profiles of sRGB differ from each other
 UP, PNG_LEVEL = 2, 3  # of PNG's filters the difference from the row above; libdeflate's level
 # Orientation -> quarter turns counter-clockwise after an optional left-right flip (EXIF 2.3).
@@ -490,179 +489,3 @@ def depth_to_uint16(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
     steps = np.zeros(depth.shape, np.uint16)
     steps[valid] = np.maximum(np.rint(inside / DEPTH_UNIT_M), 1)
     return steps
-
-
-def srgb_to_linear(image_srgb: np.ndarray) -> np.ndarray:
-    """Decode sRGB values in [0, 1] to linear light; IEC 61966-2-1."""
-    x = np.asarray(image_srgb)
-    return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.04045) + 0.055) / 1.055) ** 2.4)
-
-
-def linear_to_srgb(image_linear: np.ndarray) -> np.ndarray:
-    """Encode linear light as sRGB values in [0, 1]; IEC 61966-2-1."""
-    x = np.asarray(image_linear)
-    return np.where(
-        x <= 0.0031308, x * 12.92, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055
-    )
-
-
-LIGHT_OF_LEVEL = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
-"""Linear light (256,) of the levels of 8-bit sRGB."""
-
-# The same in 16 bits, where the darkest levels are 20 steps apart; and the inverse, the nearest
-# level of each 16-bit value.
-DEEP_LIGHT_OF_LEVEL = np.rint(65535 * LIGHT_OF_LEVEL.astype(np.float64)).astype(np.uint16)
-LEVEL_OF_DEEP_LIGHT = np.rint(255 * linear_to_srgb(np.arange(65536) / 65535)).astype(np.uint8)
-
-
-def scale_light(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Multiply an image's (H, W, 3) uint8 sRGB linear light by gain (3,), clipping at white."""
-    if not (np.isfinite(gain).all() and (gain > 0).all()):
-        raise ValueError(f"gain is {gain}, expected three finite numbers above 0")
-    table = np.rint(scaled_levels(gain)).astype(np.uint8)
-    return np.stack([table[image[..., channel], channel] for channel in range(3)], axis=-1)
-
-
-def scaled_levels(gain: np.ndarray) -> np.ndarray:
-    """Map the 256 levels of 8-bit sRGB (256, 3) when linear light is multiplied by gain (3,)."""
-    return np.minimum(255.0 * linear_to_srgb(LIGHT_OF_LEVEL[:, None] * gain), 255.0)
-
-
-def is_grey(rgb: np.ndarray) -> bool:
-    """Return whether a picture (H, W, 3) shows no colours, as that of a monochrome camera."""
-    return bool(np.ptp(rgb, axis=2).mean() <= TINT * rgb.max(axis=2).mean())
-
-
-def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize an image (H, W[, C]): average areas to shrink it, interpolate to enlarge it.
-
-    Raises:
-        ValueError: the image or its new size is empty.
-    """
-    if 0 in image.shape or min(width, height) < 1:
-        had = f"{image.shape[1]}x{image.shape[0]}"
-        raise ValueError(f"resize of {had} to {width}x{height} pixels, expected 1x1 or more")
-    shrinking = width <= image.shape[1] and height <= image.shape[0]
-    mode = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
-    image = np.ascontiguousarray(image)
-    # OpenCV averages blocks of whole pixels three times as fast as parts of pixels.
-    most = max(1, min(image.shape[1] // width, image.shape[0] // height))
-    step = max(k for k in range(1, most + 1) if image.shape[1] % k == image.shape[0] % k == 0)
-    if step > 1:
-        size = image.shape[1] // step, image.shape[0] // step
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return cv2.resize(image, (width, height), interpolation=mode)
-
-
-def shrunk_size(width: int, height: int, side: int) -> tuple[int, int]:
-    """Return width and height of an image after its longer side is reduced to ``side`` pixels."""
-    scale = side / max(width, height)
-    return (width, height) if scale >= 1 else (
-        max(1, round(width * scale)), max(1, round(height * scale))
-    )  # fmt: skip
-
-
-def shrink(image: np.ndarray, side: int) -> np.ndarray:
-    """Average an image (H, W[, C]) down to at most ``side`` pixels on its longer side."""
-    width, height = shrunk_size(image.shape[1], image.shape[0], side)
-    return image if image.shape[:2] == (height, width) else resize_area(image, width, height)
-
-
-def reduce_light(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Average an image (H, W, 3) uint8 sRGB to a smaller size in linear light.
-
-    A pixel at an outline then mixes subject and background by their areas, as keying assumes.
-    """
-    light = cv2.LUT(np.ascontiguousarray(image), DEEP_LIGHT_OF_LEVEL)
-    return LEVEL_OF_DEEP_LIGHT[resize_area(light, width, height)]
-
-
-def edge_distance(mask: np.ndarray) -> np.ndarray:
-    """Measure the distance (H, W) float32 of each pixel of a mask (H, W) to the nearest outside it.
-
-    Distances are in pixels, zero outside; the mask must have an outside. The last bit of OpenCV's
-    square roots depends on where the mask lies in memory. Squared distances are integers, so
-    rounding them gives the same bytes everywhere, up to 1,400 pixels from the edge, beyond which
-    float32 cannot distinguish them.
-    """
-    rough = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.sqrt(np.rint(np.square(rough)))
-
-
-def box_about(mask: np.ndarray, margin: int = 0) -> tuple[slice, slice]:
-    """Return rows and columns of the marked pixels of a mask (H, W), and `margin` more around."""
-    x, y, width, height = cv2.boundingRect(np.asarray(mask, np.uint8))
-    return np.s_[max(0, y - margin) : y + height + margin, max(0, x - margin) : x + width + margin]
-
-
-def disc(radius: int) -> np.ndarray:
-    """Return a disc of a radius in pixels, for morphology."""
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-
-
-def fit_into(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Scale an image (h, w[, 3]) uint8 to fit, centred on a dark (height, width, 3) tile."""
-    if image.ndim == 2:
-        image = np.repeat(image[..., None], 3, axis=2)
-    scale = min(width / image.shape[1], height / image.shape[0])
-    w, h = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-    tile = np.full((height, width, 3), 24, np.uint8)
-    y, x = (height - h) // 2, (width - w) // 2
-    tile[y : y + h, x : x + w] = resize_area(image[..., :3], w, h)
-    return tile
-
-
-WHITE, ALARM = (255, 255, 255), (255, 120, 90)
-
-
-def contact_sheet(
-    rows: Sequence[Sequence[np.ndarray]],
-    labels: Sequence[str | Sequence[str]] = (),
-    tile: tuple[int, int] = (160, 160),
-    captions: Sequence[str] = (),
-    alarming: Collection[str] = (),
-) -> np.ndarray:
-    """Lay out rows of images as one picture (H, W, 3) uint8.
-
-    A row's label is one text, or one per image; ``captions`` stand above the columns. Labels that
-    are ``alarming`` are red.
-    """
-    columns = max((len(row) for row in rows), default=1)
-    blank = np.full((*tile, 3), 24, np.uint8)
-    lines = []
-    if captions:
-        lines.append(np.full((20, columns * tile[1], 3), 24, np.uint8))
-        _write_texts(lines[0], captions, tile[1])
-    for number, row in enumerate(rows):
-        tiles = [fit_into(image, *tile) for image in row]
-        line = np.concatenate(tiles + [blank] * (columns - len(tiles)), axis=1)
-        if number < len(labels) and labels[number]:
-            line[:20] //= 3  # a dark band, so that white text is legible on any picture
-            label = labels[number]
-            texts = [label] if isinstance(label, str) else label
-            _write_texts(line, texts, tile[1], alarming)
-        lines.append(line)
-    return np.concatenate(lines, axis=0) if lines else blank
-
-
-def _write_texts(
-    line: np.ndarray, texts: Sequence[str], step: int, alarming: Collection[str] = ()
-) -> None:
-    for number, text in enumerate(texts):
-        end = None if len(texts) == 1 else (number + 1) * step
-        colour = ALARM if text in alarming else WHITE
-        font = cv2.FONT_HERSHEY_SIMPLEX
-        cv2.putText(line[:, number * step : end], text, (5, 14), font, 0.42, colour, 1, cv2.LINE_AA)
-
-
-def tile_sheet(
-    pictures: Mapping[str, np.ndarray], columns: int, side: int, alarming: Collection[str] = ()
-) -> np.ndarray:
-    """Lay out named pictures in rows of square tiles, each with its name above it.
-
-    Names that are ``alarming`` are red.
-    """
-    names = list(pictures)
-    rows = [names[k : k + columns] for k in range(0, len(names), columns)]
-    tiles = [[pictures[name] for name in row] for row in rows]
-    return contact_sheet(tiles, rows, (side, side), alarming=alarming)

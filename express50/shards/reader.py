@@ -31,8 +31,8 @@ import numpy as np
 from express50.contract.segmentation_labels import COLOURS
 from express50.errors import FormatError, check_known
 from express50.files.arrays import read_arrays, read_npy
-from express50.files.images import contact_sheet
 from express50.files.text import KEY_LENGTH, no_folder, parse_json, read_json, refusing
+from express50.geometry.pixels import contact_sheet
 from express50.geometry.shapes import check_finite, check_shape
 from express50.shards.codecs import AGAIN, ALPHA, DEPTH, PARTS, RGB, crc32, decode_picture
 

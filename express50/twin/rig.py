@@ -13,9 +13,9 @@ from functools import cache
 import cv2
 import numpy as np
 
-from express50.files.images import linear_to_srgb
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_centres, corner_to_cell
+from express50.geometry.pixels import linear_to_srgb
 from express50.geometry.sampling import smoothstep
 from express50.geometry.transforms import axis_angle_to_matrix, look_at, make_transform
 from express50.twin.render import RowBand, bands, ray_pattern

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from express50.files.images import LIGHT_OF_LEVEL
 from express50.geometry.conventions import corner_to_opencv_pixels
+from express50.geometry.pixels import LIGHT_OF_LEVEL
 from pipelines.calibrate.board import Board, opencv_board
 
 LEAST_SHARED = 12  # squares that two cameras must see together to be compared

@@ -18,9 +18,9 @@ import open3d as o3d
 
 from express50.capture.frames import reduced
 from express50.error_model import HEAD_SIZE_SPREAD, Bounds, error_bounds
-from express50.files.images import box_about
 from express50.geometry.cameras import Camera, crop_camera, cut_about, rays, resized, unproject
 from express50.geometry.conventions import cell_centres, cell_to_corner
+from express50.geometry.pixels import box_about
 from express50.geometry.raycast import barycentrics, camera_rays, join_rays, mesh_scene
 from express50.geometry.sampling import bilinear, edge_width, local_moments
 from pipelines.depth.prior import TrackedSolid

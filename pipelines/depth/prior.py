@@ -11,10 +11,10 @@ import numpy as np
 import open3d as o3d
 from scipy.spatial import cKDTree
 
-from express50.files.images import disc, shrunk_size
 from express50.geometry.cameras import inside_frame, rays, resized
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.meshes import open_edges
+from express50.geometry.pixels import disc, shrunk_size
 from express50.geometry.raycast import camera_rays, join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
 from express50.geometry.transforms import unit

@@ -17,8 +17,9 @@ from express50.dataset.depth_files import encode_depth, encode_normals, write_de
 from express50.dataset.tracks import read_track
 from express50.error_model import error_models, expect, single_camera_sigma
 from express50.errors import UNREADABLE, StageError, advised
-from express50.files.images import contact_sheet, shrink, srgb_to_linear, write_image
+from express50.files.images import write_image
 from express50.geometry.meshes import encode_glb, write_surface
+from express50.geometry.pixels import contact_sheet, shrink, srgb_to_linear
 from express50.geometry.sampling import evenly
 from express50.head.load import load_topology
 from pipelines.depth.maps import (

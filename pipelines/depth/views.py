@@ -14,9 +14,9 @@ from express50.capture.frames import reduced
 from express50.contract.segmentation_labels import label_mask
 from express50.contract.stage import Note
 from express50.errors import StageError
-from express50.files.images import box_about, resize_area
 from express50.geometry.cameras import Camera, nearest_to_lines, project
 from express50.geometry.conventions import cell_to_corner
+from express50.geometry.pixels import box_about, resize_area
 from express50.geometry.sampling import bilinear
 from express50.geometry.transforms import is_rigid
 from pipelines.regions.geometry import FACE, TrackedHead, render_head

@@ -21,8 +21,9 @@ from express50.contract.layout import PLATES, Dataset
 from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, StageError
 from express50.files.atomic import write_json
-from express50.files.images import shrink, shrunk_size, tile_sheet, write_image
+from express50.files.images import write_image
 from express50.geometry.cameras import resized
+from express50.geometry.pixels import shrink, shrunk_size, tile_sheet
 from express50.geometry.sampling import evenly, pictured_share
 
 COLUMNS = 6  # of the contact sheet

@@ -13,8 +13,8 @@ from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note
 from express50.errors import CaptureError, StageError
-from express50.files.images import disc
 from express50.geometry.cameras import Camera, inside_frame, project_pinhole
+from express50.geometry.pixels import disc
 from express50.landmarks import EMBEDDED
 from pipelines.calibrate.footage_rig import INNER
 from pipelines.imports.pictures import PeakFrame, pixels_showing

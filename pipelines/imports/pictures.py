@@ -19,7 +19,7 @@ from express50.contract.layout import Dataset
 from express50.dataset.depth_files import FARTHEST_M as BACKGROUND_M
 from express50.errors import ConfigError, FormatError, StageError
 from express50.files.arrays import read_npy
-from express50.files.images import read_image, resize_area
+from express50.files.images import read_image
 from express50.files.text import expanded
 from express50.geometry.cameras import (
     Camera,
@@ -31,6 +31,7 @@ from express50.geometry.cameras import (
 )
 from express50.geometry.conventions import K_to_opencv, cell_centres, cell_to_corner
 from express50.geometry.meshes import write_surface
+from express50.geometry.pixels import resize_area
 from express50.geometry.sampling import undistort_image, undistort_maps
 
 PLACES = ("subject", "expression", "camera", "frame", "clip_frame")

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import scipy
 
-from express50.files.images import linear_to_srgb, shrink, srgb_to_linear
 from express50.files.video import VideoTags
+from express50.geometry.pixels import linear_to_srgb, shrink, srgb_to_linear
 from express50.geometry.sampling import edge_width
 
 SIDE = 96  # longer side, pixels, of the images in which movement is measured

@@ -25,11 +25,11 @@ from express50.files.images import (
     foreign_profile,
     has_alpha,
     read_exif,
-    shrink,
     upright,
 )
 from express50.files.text import reason, unreadable
 from express50.files.video import FPS_SLACK, VideoTags, iterate_sparsely, iterate_video, video_fps
+from express50.geometry.pixels import shrink
 from pipelines.ingest.quality import CameraMeasurements, FrameMeasures
 
 BEYOND = 0.01  # share of the first picture outside of a range that no flag states

@@ -41,10 +41,11 @@ from express50.errors import CaptureError, StageError, advised, few, nearest
 from express50.files.atomic import dump_json, write_json
 from express50.files.calibration import write_cameras
 from express50.files.digests import stat_digest, text_digest
-from express50.files.images import contact_sheet, write_image
+from express50.files.images import write_image
 from express50.files.text import KEY_LENGTH
 from express50.files.video import FPS_SLACK
 from express50.geometry.cameras import Camera
+from express50.geometry.pixels import contact_sheet
 from express50.rigs.camera_builder import at_size
 from pipelines.ingest.quality import CameraMeasurements, check_quality
 from pipelines.ingest.scan import (

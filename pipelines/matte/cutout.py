@@ -19,9 +19,9 @@ import numpy as np
 from scipy.ndimage import binary_fill_holes, gaussian_filter
 
 from express50.errors import NoFaceError
-from express50.files.images import box_about, shrink
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import corner_to_cell
+from express50.geometry.pixels import box_about, shrink
 from express50.geometry.transforms import transform_points
 from pipelines.matte.visual_hull import (
     FEWEST,

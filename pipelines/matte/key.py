@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.files.images import LIGHT_OF_LEVEL, box_about, shrink
+from express50.geometry.pixels import LIGHT_OF_LEVEL, box_about, shrink
 from pipelines.matte.plates import (
     ODD_STEPS,
     PlateModel,

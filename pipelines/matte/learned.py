@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
-from express50.files.images import resize_area
 from express50.geometry.conventions import cell_centres
+from express50.geometry.pixels import resize_area
 from pipelines.networks import Network, Role
 
 BGMV2 = Role(setting="matte.weights", inputs=("src", "bgr"), outputs=("pha",))

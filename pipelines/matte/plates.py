@@ -19,14 +19,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from express50.files.images import (
+from express50.geometry.conventions import affine_from_opencv, affine_to_opencv
+from express50.geometry.pixels import (
     LIGHT_OF_LEVEL,
     linear_to_srgb,
     scaled_levels,
     shrink,
     srgb_to_linear,
 )
-from express50.geometry.conventions import affine_from_opencv, affine_to_opencv
 
 LEVELS = np.linspace(16.0, 240.0, 8)  # 8-bit intensities at which noise is tabulated
 MOST_NOISE = 14.0  # 8-bit steps; larger differences are not noise, whatever the camera

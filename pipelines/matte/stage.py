@@ -15,8 +15,9 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.error_model import error_bounds, error_models, expect
 from express50.errors import CaptureError, NoFaceError, StageError
-from express50.files.images import box_about, resize_area, shrink, tile_sheet, write_image
+from express50.files.images import write_image
 from express50.geometry.cameras import Camera, pinhole, resized
+from express50.geometry.pixels import box_about, resize_area, shrink, tile_sheet
 from express50.geometry.sampling import evenly, local_moments, undistorted_mask
 from pipelines.matte.cutout import (
     MANY,

@@ -23,9 +23,9 @@ import numpy as np
 from scipy import ndimage
 
 from express50.contract.stage import Note
-from express50.files.images import is_grey
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_centres, opencv_pixels_to_corner
+from express50.geometry.pixels import is_grey
 from express50.rigs.world_frame import meeting_point
 from pipelines.matte.plates import GREY, darkening
 

@@ -22,8 +22,8 @@ import numpy as np
 from express50.capture.frames import read_written
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError, NoFaceError
-from express50.files.images import edge_distance, shrink
 from express50.geometry.cameras import Camera, pinhole, resized
+from express50.geometry.pixels import edge_distance, shrink
 from express50.geometry.sampling import undistorted_mask
 from pipelines.matte.cutout import FACES, Cut, CutView, HeadPlace, cut_out, find_head, make_cut_view
 from pipelines.matte.plates import (

@@ -38,15 +38,13 @@ from express50.files.images import (
     DEPTH_LIMIT_M,
     DEPTH_UNIT_M,
     depth_to_uint16,
-    linear_to_srgb,
     read_alpha,
     read_image,
-    resize_area,
-    scale_light,
 )
 from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera, crop_camera, project, resized
 from express50.geometry.conventions import cell_centres, corner_to_cell
+from express50.geometry.pixels import linear_to_srgb, resize_area, scale_light
 from express50.shards.codecs import encode_pictures
 from express50.shards.writer import PackedSample, sample_key
 from pipelines.matte.plates import (

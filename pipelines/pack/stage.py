@@ -19,8 +19,9 @@ from express50.contract.layout import Dataset, exclusion_reason
 from express50.contract.stage import Note, Result
 from express50.errors import UNREADABLE, FormatError, StageError, advised, few
 from express50.files.atomic import write_json
-from express50.files.images import contact_sheet, write_image
+from express50.files.images import write_image
 from express50.files.text import read_json_table
+from express50.geometry.pixels import contact_sheet
 from express50.shards.reader import ShardReader, sample_panels, write_offsets, write_registered
 from express50.shards.writer import ShardWriter, gather_shards, write_manifest
 from pipelines.pack.sample import encode_sample, load_sample, read_subject

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.ndimage import binary_fill_holes, gaussian_filter
 
 from express50.contract.segmentation_labels import LABELS, label_mask
-from express50.files.images import LIGHT_OF_LEVEL, disc, edge_distance, is_grey
+from express50.geometry.pixels import LIGHT_OF_LEVEL, disc, edge_distance, is_grey
 from express50.geometry.sampling import robust_moments
 from pipelines.regions.geometry import HAIR, SCALP, TORSO, HeadGeometry
 

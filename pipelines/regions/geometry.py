@@ -10,10 +10,10 @@ import numpy as np
 import open3d as o3d
 
 from express50.contract.segmentation_labels import HEAD, LABELS, label_mask
-from express50.files.images import disc, edge_distance
 from express50.geometry.cameras import Camera, cut_about, project, rays, unproject
 from express50.geometry.conventions import opencv_pixels_to_corner
 from express50.geometry.meshes import mesh_parts
+from express50.geometry.pixels import disc, edge_distance
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.head.load import HeadTopology
 

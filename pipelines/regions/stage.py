@@ -16,8 +16,9 @@ from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import existing_track, read_track
 from express50.errors import UNREADABLE, FormatError, StageError, advised
-from express50.files.images import box_about, contact_sheet, fit_into, write_image
+from express50.files.images import write_image
 from express50.geometry.cameras import Camera, cut_about, project
+from express50.geometry.pixels import box_about, contact_sheet, fit_into
 from express50.geometry.sampling import evenly
 from express50.head.load import load_topology
 from pipelines.regions.colour import (

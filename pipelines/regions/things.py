@@ -24,7 +24,6 @@ from scipy import ndimage
 
 from express50.capture.frames import reduced
 from express50.contract.segmentation_labels import LABELS, label_mask
-from express50.files.images import LIGHT_OF_LEVEL, box_about, disc
 from express50.geometry.cameras import (
     Camera,
     crop_camera,
@@ -35,6 +34,7 @@ from express50.geometry.cameras import (
     unproject,
 )
 from express50.geometry.conventions import cell_to_corner, corner_to_cell
+from express50.geometry.pixels import LIGHT_OF_LEVEL, box_about, disc
 from express50.geometry.raycast import join_rays
 from express50.geometry.sampling import local_moments
 from express50.geometry.transforms import unit

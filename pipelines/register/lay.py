@@ -17,8 +17,8 @@ import torch
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial import cKDTree
 
-from express50.files.images import srgb_to_linear
 from express50.geometry.meshes import cotangent_laplacian
+from express50.geometry.pixels import srgb_to_linear
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import robust_moments
 from express50.geometry.transforms import unit

@@ -14,8 +14,8 @@ import open3d as o3d
 import torch
 
 from express50.errors import StageError
-from express50.files.images import linear_to_srgb
 from express50.geometry.cameras import Camera, pinhole_camera, rays
+from express50.geometry.pixels import linear_to_srgb
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.geometry.transforms import look_at, rigid_fit
 from express50.head.load import load_head

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from express50.errors import FormatError, StageError
-from express50.files.images import srgb_to_linear
 from express50.files.text import MALFORMED, read_json, read_text, refusing
 from express50.geometry.meshes import check_faces
+from express50.geometry.pixels import srgb_to_linear
 from express50.geometry.transforms import similarity_fit
 
 KINDS = (".obj", ".ply", ".glb", ".stl")

@@ -23,10 +23,11 @@ from express50.dataset.tracks import (
 from express50.error_model import error_bounds, single_camera_sigma
 from express50.errors import FormatError, StageError, advised, rounded_down
 from express50.files.digests import file_sha256
-from express50.files.images import contact_sheet, write_image
+from express50.files.images import write_image
 from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
 from express50.geometry.meshes import read_surface
+from express50.geometry.pixels import contact_sheet
 from express50.geometry.transforms_torch import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import HeadModel, joint_angles, joint_transforms

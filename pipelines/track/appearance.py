@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 
 from express50.errors import StageError
-from express50.files.images import linear_to_srgb, write_image
+from express50.files.images import write_image
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_to_corner
+from express50.geometry.pixels import linear_to_srgb
 from express50.geometry.raycast import visible_faces
 from express50.geometry.sampling import sh_polynomials
 from express50.head.model import HeadModel, normals_of

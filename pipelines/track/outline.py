@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from express50.files.images import edge_distance
 from express50.geometry.cameras import (
     Camera,
     depth_in,
@@ -20,6 +19,7 @@ from express50.geometry.cameras import (
     project_with_slope,
     resized,
 )
+from express50.geometry.pixels import edge_distance
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear_slope
 from express50.head.model import HeadModel, in_regions

@@ -12,9 +12,10 @@ import torch
 
 from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
-from express50.files.images import ALARM, tile_sheet, write_image
+from express50.files.images import write_image
 from express50.geometry.cameras import Camera, pinhole_camera, project_pinhole
 from express50.geometry.conventions import affine_to_opencv
+from express50.geometry.pixels import ALARM, tile_sheet
 from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.geometry.transforms import transform_points
 from express50.head.model import HeadModel, landmarks, landmarks_of

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from express50.files.images import LIGHT_OF_LEVEL, disc, resize_area
 from express50.geometry.cameras import Camera, cut_about, inside_frame, project_pinhole, resized
+from express50.geometry.pixels import LIGHT_OF_LEVEL, disc, resize_area
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear_slope
 from express50.geometry.transforms import unit

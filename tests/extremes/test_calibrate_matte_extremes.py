@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from express50.errors import CalibrationError
 from express50.files.containers import read_picture
-from express50.files.images import linear_to_srgb, srgb_to_linear, write_image
+from express50.files.images import write_image
+from express50.geometry.pixels import linear_to_srgb, srgb_to_linear
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate.board import gather, refine_corners, square_sides
 from pipelines.calibrate.board_rig import solve_rig

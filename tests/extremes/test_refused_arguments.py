@@ -11,8 +11,9 @@ import torch
 from annotations.align.features import measure
 from annotations.align.suggest import suggest
 from express50.errors import CalibrationError, FormatError, StageError
-from express50.files.images import encode_png, resize_area
+from express50.files.images import encode_png
 from express50.geometry.cameras import pinhole_camera, resized, scale_camera
+from express50.geometry.pixels import resize_area
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.head.model import pose
 from express50.rigs.world_frame import check_meeting

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.files.images import linear_to_srgb, read_image
+from express50.files.images import read_image
+from express50.geometry.pixels import linear_to_srgb
 from pipelines.track.appearance import EVEN_LIGHT, Appearance, bake_albedo, write_texture
 from pipelines.track.observe import Observation
 from pipelines.track.outline import matte_distance, outline_terms, outline_vertices

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.files.images import linear_to_srgb, srgb_to_linear
+from express50.geometry.pixels import linear_to_srgb, srgb_to_linear
 
 COLOURS = {  # skin and hair, 8-bit steps
     "dark": ((110, 80, 65), (45, 32, 25)),

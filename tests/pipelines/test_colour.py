@@ -13,8 +13,9 @@ from express50.capture.frames import read_gains
 from express50.contract.layout import Dataset
 from express50.errors import FormatError
 from express50.files.atomic import write_json
-from express50.files.images import scale_light, srgb_to_linear, write_image
+from express50.files.images import write_image
 from express50.geometry.cameras import pinhole_camera
+from express50.geometry.pixels import scale_light, srgb_to_linear
 from express50.geometry.transforms import make_transform
 from pipelines.calibrate import STAGE as CALIBRATE
 from pipelines.calibrate.board import detect_corners, make_detector

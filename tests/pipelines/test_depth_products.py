@@ -11,8 +11,9 @@ from express50.dataset.depth_files import depth_file, read_depth, read_normals
 from express50.dataset.tracks import read_track
 from express50.errors import ConfigError
 from express50.files.atomic import write_json
-from express50.files.images import read_image, srgb_to_linear
+from express50.files.images import read_image
 from express50.geometry.cameras import transform_camera
+from express50.geometry.pixels import srgb_to_linear
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import make_transform
 from express50.head.load import load_head

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.files.images import linear_to_srgb, srgb_to_linear
+from express50.geometry.pixels import linear_to_srgb, srgb_to_linear
 from pipelines.pack.sample import Crop, cut_own_colours, own_colours
 
 

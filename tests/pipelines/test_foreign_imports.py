@@ -19,9 +19,10 @@ from express50.dataset.depth_files import read_depth
 from express50.dataset.tracks import read_track
 from express50.errors import StageError
 from express50.files.calibration import read_cameras, write_cameras
-from express50.files.images import read_alpha, shrink, write_image
+from express50.files.images import read_alpha, write_image
 from express50.geometry.conventions import FLIP_YZ
 from express50.geometry.meshes import read_surface
+from express50.geometry.pixels import shrink
 from express50.geometry.transforms import make_transform
 from express50.runner.ledger import Ledger
 from pipelines.depth import STAGE as DEPTH

@@ -22,15 +22,9 @@ from express50.capture.index import read_index, read_peaks
 from express50.contract.layout import PLATES, Dataset
 from express50.errors import CaptureError, ConfigError, FormatError
 from express50.files.calibration import write_cameras
-from express50.files.images import (
-    LIGHT_OF_LEVEL,
-    read_image,
-    reduce_light,
-    shrink,
-    shrunk_size,
-    write_image,
-)
+from express50.files.images import read_image, write_image
 from express50.geometry.cameras import pinhole, project
+from express50.geometry.pixels import LIGHT_OF_LEVEL, reduce_light, shrink, shrunk_size
 from express50.geometry.sampling import undistort_image
 from pipelines.calibrate import footage
 from pipelines.frames import STAGE, stage

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from express50.contract.layout import Dataset
-from express50.files.images import linear_to_srgb, srgb_to_linear
+from express50.geometry.pixels import linear_to_srgb, srgb_to_linear
 from pipelines import ingest
 from pipelines.ingest.quality import (
     describe_steps,

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.files.images import shrink
 from express50.geometry.cameras import Camera
+from express50.geometry.pixels import shrink
 from pipelines.matte.stage import SHOWN, corrected, make_view
 from pipelines.matte.visual_hull import Ball, compare_mattes, lacking_if_moved
 from tests.pipelines.matte_rig import SIZE, disc, make_views, with_alpha

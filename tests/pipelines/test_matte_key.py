@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.matte_scenes import make_scene as hair_before
 from express50.errors import ConfigError
-from express50.files.images import linear_to_srgb, srgb_to_linear
+from express50.geometry.pixels import linear_to_srgb, srgb_to_linear
 from pipelines.matte import MatteConfig
 from pipelines.matte.key import (
     dilated,

@@ -18,8 +18,9 @@ from express50.contract.segmentation_labels import LABELS
 from express50.dataset.depth_files import read_depth
 from express50.errors import StageError
 from express50.files.atomic import write_json
-from express50.files.images import read_image, srgb_to_linear, write_image
+from express50.files.images import read_image, write_image
 from express50.geometry.cameras import pinhole_camera, project, unproject
+from express50.geometry.pixels import srgb_to_linear
 from express50.geometry.transforms import look_at
 from express50.shards.reader import ShardReader
 from express50.shards.writer import verify

@@ -15,8 +15,8 @@ from express50.capture.index import Cue
 from express50.dataset.tracks import SEQUENCE_SCHEMA
 from express50.errors import StageError
 from express50.files.atomic import write_json
-from express50.files.images import shrunk_size
 from express50.geometry.cameras import project
+from express50.geometry.pixels import shrunk_size
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.landmarks.detector import Detection
 from express50.landmarks.irises import Irises

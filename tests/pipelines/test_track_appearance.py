@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from express50.errors import StageError
-from express50.files.images import linear_to_srgb, read_image
+from express50.files.images import read_image
+from express50.geometry.pixels import linear_to_srgb
 from express50.geometry.sampling import sh_polynomials
 from pipelines.track.appearance import (
     EVEN_LIGHT,

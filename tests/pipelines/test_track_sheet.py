@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from express50.files.images import ALARM, read_image
+from express50.files.images import read_image
+from express50.geometry.pixels import ALARM
 from pipelines.track.report import (
     DIM,
     SHEET_TILE,

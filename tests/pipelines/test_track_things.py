@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from express50.files.images import linear_to_srgb
 from express50.geometry.cameras import project, unproject
+from express50.geometry.pixels import linear_to_srgb
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from pipelines.regions.geometry import head_labels, make_head

@@ -17,8 +17,9 @@ from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.dataset.export_avatar import centred
 from express50.files.calibration import read_cameras, write_cameras
-from express50.files.images import read_alpha, read_image, srgb_to_linear, write_image
+from express50.files.images import read_alpha, read_image, write_image
 from express50.geometry.meshes import split_seams
+from express50.geometry.pixels import srgb_to_linear
 from express50.head.load import load_head
 from express50.head.model import normals_of
 from express50.rigs.per_picture import read_transforms
