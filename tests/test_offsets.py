@@ -160,7 +160,7 @@ def test_damaged_registered_meshes_are_one_clear_error(packed, tmp_path) -> None
     )
     for change, words in changes:
         np.savez(tmp_path / "S001.registered.npz", **(good | change))
-        with pytest.raises(FormatError, match=f"S001.registered.npz: {words}.*express50 pack"):
+        with pytest.raises(FormatError, match=f"S001.registered.npz: .*{words}.*express50 pack"):
             ShardReader(tmp_path, ()).registered("S001")
     with pytest.raises(FormatError, match=r"S002.registered.npz: no such file; .*express50 pack"):
         ShardReader(tmp_path, ()).registered("S002")
