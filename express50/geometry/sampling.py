@@ -1,4 +1,4 @@
-"""Undistort and sample images, measure their blur; choose evenly, step smoothly, and so on."""
+"""Undistort and sample images and measure their blur; choose items evenly; steps and harmonics."""
 
 from __future__ import annotations
 
