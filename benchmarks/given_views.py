@@ -45,11 +45,11 @@ def write_given_capture(
             (folder / "plates").mkdir(exist_ok=True)
             write_image(folder / "plates" / f"{name}.png", plate)
     write_cameras(folder / "calibration.json", {name: known[name] for name in cameras})
-    meta = read_index(dataset, subject).meta
-    stated = {key: meta[key] for key in ("consent_id", "consent", "licence") if key in meta}
-    lines = [f"{key} = {json.dumps(value)}\n" for key, value in stated.items()]
-    words = "".join([f'subject = "{subject}"\nfps = 24\n', *lines])
-    (folder / "capture.toml").write_text(words)
+    meta = read_index(dataset, subject).meta | {"subject": subject}
+    stated = {key: str(meta[key]) for key in ("subject", "consent_id", "licence") if key in meta}
+    # In TOML, a text may be written as in JSON.
+    lines = [f"{key} = {json.dumps(text, ensure_ascii=False)}" for key, text in stated.items()]
+    (folder / "capture.toml").write_text("\n".join([*lines, "fps = 24", ""]), encoding="utf-8")
     rows = f"expression_id,start_frame,end_frame\n{expression},0,0\n"
     (folder / "cues.csv").write_text(rows)
     return folder

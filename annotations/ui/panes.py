@@ -30,6 +30,14 @@ from annotations.ui.task import CueView, TaskScene
 from express50.capture.index import Index
 from express50.errors import AnnotationError
 
+AHEAD = 64  # frames about the cursor that are decoded before they are asked for
+GUTTER = 10  # cells left of the curves, for their names
+WIDEST = 7  # cells of a frame where the window is short
+_BARS = " ▁▂▃▄▅▆▇█"
+
+Cell = tuple[str, Style]
+Line = list[Cell]
+
 
 @dataclass(frozen=True)
 class FrameLook:
@@ -117,9 +125,6 @@ class PicturePane(Widget):
         return [line.apply_filter(theme.UNCOLOURED, self.background_colors[1]) for line in lines]
 
 
-AHEAD = 64  # frames about the cursor that are decoded before they are asked for
-
-
 class Aim(NamedTuple):
     """The view of the pictures."""
 
@@ -205,6 +210,17 @@ def shots_ahead(
     return shots
 
 
+@dataclass(frozen=True, kw_only=True)
+class StripContent:
+    """Content of the strip; the curves start at the window's first frame."""
+
+    view: CueView
+    activity: tuple[float, ...] = ()
+    match: tuple[float, ...] = ()
+    mine: Label | None = None
+    in_force: Label | None = None
+
+
 def strip_content(scene: TaskScene, view: CueView, hidden: bool) -> StripContent:
     """Collect the timeline's content, without suggestions while those are hidden."""
     if hidden or scene.suggestion is None:
@@ -218,26 +234,6 @@ def strip_content(scene: TaskScene, view: CueView, hidden: bool) -> StripContent
         if values
     }
     return StripContent(view=view, mine=scene.mine, in_force=scene.in_force, **curves)
-
-
-GUTTER = 10  # cells left of the curves, for their names
-WIDEST = 7  # cells of a frame where the window is short
-_BARS = " ▁▂▃▄▅▆▇█"
-
-
-@dataclass(frozen=True, kw_only=True)
-class StripContent:
-    """Content of the strip; the curves start at the window's first frame."""
-
-    view: CueView
-    activity: tuple[float, ...] = ()
-    match: tuple[float, ...] = ()
-    mine: Label | None = None
-    in_force: Label | None = None
-
-
-Cell = tuple[str, Style]
-Line = list[Cell]
 
 
 def frame_cells(frames: int, width: int) -> tuple[int, int]:
