@@ -17,6 +17,7 @@ import math
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -131,15 +132,19 @@ def run_one(
         if pilot:
             (dataset.root / "dial").mkdir(parents=True, exist_ok=True)
             shutil.copy2(out / "tuned" / "dial" / "measured.json", dataset.root / "dial")
+        started = time.monotonic()
         code = express50(
             ["run", str(dataset.root), *map(str, captures), "--workers", str(workers), *options]
         )
-        (dataset.root / "done.json").write_text(json.dumps({"code": code}))
+        done = {"code": code, "seconds": time.monotonic() - started}
+        (dataset.root / "done.json").write_text(json.dumps(done))
     record = dataset.root / "dial" / "run.json"
     budget = parse_budget(options[1]).seconds if options[0] == "--budget" else None
     if not record.is_file():
-        made = json.loads((dataset.root / "done.json").read_text())["code"] == 0
-        return Run(name, core_seconds(dataset), budget, None, {}, {}, {}, made)
+        done = json.loads((dataset.root / "done.json").read_text())
+        # Budgets without workers are of processor time, others of the clock's.
+        seconds = done["seconds"] if workers else core_seconds(dataset)
+        return Run(name, seconds, budget, None, {}, {}, {}, done["code"] == 0)
     row = json.loads(record.read_text())
     keys = ("spent", "seconds", "settings", "promised", "finished")
     spent, expected, settings, promised, finished = (row[key] for key in keys)
@@ -147,7 +152,9 @@ def run_one(
 
 
 def core_seconds(dataset: Dataset) -> float:
-    """Sum up the processor time of a dataset's items."""
+    """Sum up the processor time of a dataset's items; 0 if its run was refused."""
+    if not dataset.ledger.is_file():
+        return 0.0
     with Ledger(dataset.ledger, read_only=True) as ledger:
         return sum(r.core_seconds for name in stages() for r in ledger.read(name).values())
 

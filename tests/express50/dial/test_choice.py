@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.budget import Run, figures, quick_budgets
+from benchmarks.budget import Run, figures, quick_budgets, run_one
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, NoSettings, Stage
 from express50.dial.choice import (
@@ -113,6 +113,17 @@ def test_a_refused_budget_is_a_miss_only_where_a_preset_would_have_fitted():
     small, fair = (Run("d", 5.0, budget, None, {}, {}, {}, False) for budget in (20.0, 40.0))
     assert figures([small], presets, True)["time_miss_percent"] == 0
     assert figures([fair], presets, True)["time_miss_percent"] == 100
+
+
+def test_a_run_that_was_refused_before_it_made_anything_is_still_a_row(tmp_path):
+    done = tmp_path / "budget-1m" / "done.json"
+    done.parent.mkdir()
+    done.write_text('{"code": 2, "seconds": 3.0}')
+    by_clock, core = (
+        run_one(tmp_path, "budget-1m", [], n, ["--budget", "1m"], False) for n in (2, 0)
+    )
+    assert (by_clock.seconds, by_clock.budget, by_clock.finished) == (3.0, 60.0, False)
+    assert core.seconds == 0
 
 
 def test_a_result_that_is_right_in_most_runs_does_not_outweigh_all_others():
