@@ -72,7 +72,7 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
         argument("dataset", type=dataset_folder, metavar="DATASET", help="folder of the dataset")
         for kind in ("subject", "expression"):
             if f"{kind}s" in shared:
-                words = f"only this {kind}; may be repeated"
+                words = f"only this {kind}; may be repeated (default: all)"
                 argument(f"--{kind}", action="append", metavar="ID", help=words)
         if "subject" in shared or "clip" in shared:
             argument("subject", metavar="SUBJECT", help="subject's id")
@@ -93,7 +93,12 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     _add_reviewing_actions(add)
     words = "print or choose the reference person, to whose frames all others are matched"
     argument = add("reference", run_reference, words)
-    argument("subject", nargs="?", metavar="SUBJECT", help="new reference (default: print it)")
+    argument(
+        "subject",
+        nargs="?",
+        metavar="SUBJECT",
+        help="new reference (default: print the present one)",
+    )
     words = "label clips (e0 to e11, or --expression) by RenderMe-360's last-frame rule"
     add("rule", run_rule, words, "subjects", "expressions")
     words = "exclude a subject from all stages, and record the reason"
@@ -111,9 +116,11 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
 
 def _add_labelling_actions(add: Callable[..., Callable]) -> None:
     argument = add("ui", run_ui, "label peak frames in the terminal", "annotator")
-    argument("--subjects", metavar="GLOB", help="only subjects that match, such as 'S00*'")
-    argument("--expressions", metavar="GLOB", help="only expressions that match")
-    order = "order of the tasks (default: %(default)s)"
+    argument(
+        "--subjects", metavar="GLOB", help="only subjects that match, such as 'S00*' (default: all)"
+    )
+    argument("--expressions", metavar="GLOB", help="only expressions that match (default: all)")
+    order = "most doubtful first, by expression, or by subject (default: %(default)s)"
     argument("--order", choices=ORDERS, default="doubt", help=order)
     words = "hide suggestions and others' marks until you decide"
     argument("--blind", action="store_true", help=words)
@@ -128,13 +135,13 @@ def _add_labelling_actions(add: Callable[..., Callable]) -> None:
     words = "list at most this many (default: %(default)s)"
     argument("--count", type=number(0), default=10, metavar="N", help=words)
     argument = add("mark", run_mark, "mark the peak frame of an expression", "clip", "annotator")
-    argument("frame", type=number(0), metavar="FRAME", help="0-based decode index")
+    argument("frame", type=number(0), metavar="FRAME", help="the frame's decode index, from 0")
     words = "camera in which you judged it (default: the suggestion's)"
     argument("--camera", metavar="ID", help=words)
     argument("--first", type=number(0), metavar="FRAME", help="first frame of the plateau")
     argument("--last", type=number(0), metavar="FRAME", help="last frame of the plateau")
     argument = add("flag", run_flag, "record that an expression has no peak", "clip", "annotator")
-    argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", ...")
+    argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", or your own words")
     add("undo", run_undo, "undo your last label of an expression", "clip", "annotator")
     add("labels", run_labels, "list every label in force", "subjects")
 

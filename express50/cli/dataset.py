@@ -103,18 +103,22 @@ def add_shards(subparsers: Any) -> None:
     for action in (verify, listing, show, split):
         action.add_argument("directory", type=Path, metavar="DIR", help="folder of shards")
     show.add_argument("key", nargs="?", metavar="KEY", help="sample to show (default: the first)")
-    words = "also draw colours, matte and depth into this picture"
+    words = "also draw colours, matte and depth into this picture, .png or .jpg"
     show.add_argument("--out", type=Path, metavar="FILE", help=words)
     merge.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="folders of shards")
     for action, names in ((listing, ("subject",)), (split, ("subject", "expression", "camera"))):
         for name in names:
-            words = f"only this {name}; may be repeated"
+            words = f"only this {name}; may be repeated (default: all)"
             action.add_argument(f"--{name}", action="append", metavar="ID", help=words)
     for action in (listing, split):
-        action.add_argument("--split", metavar="NAME", help="only samples of this split")
+        action.add_argument(
+            "--split",
+            metavar="NAME",
+            help="only samples of this split, such as test (default: all)",
+        )
     for action in (split, merge):
         action.add_argument("out", type=Path, metavar="OUT", help="folder to make, or an empty one")
-        words = "size of a shard, MB (default: 256)"
+        words = "begin a new shard after this size, MB (default: 256)"
         action.add_argument("--shard-mb", type=number(1), default=256, metavar="MB", help=words)
 
 

@@ -25,9 +25,10 @@ def add_commands(subparsers: Any) -> None:
     )  # fmt: skip
     add = parser.add_argument
     add("out", type=Path, metavar="OUT", help="folder to write to, one folder per subject")
-    add("--format", required=True, choices=FORMATS, help="what to write")
+    words = "what to write: a data set for GaussianAvatars, or meshes"
+    add("--format", required=True, choices=FORMATS, help=words)
     for name in ("subject", "expression"):
-        words = f"only this {name}; may be repeated"
+        words = f"only this {name}; may be repeated (default: all)"
         add(f"--{name}", action="append", default=[], metavar="ID", help=words)
     words = "a mesh per peak, or per tracked frame (which needs track.frames=clips, or a video)"
     words += " (default: peaks)"
@@ -35,9 +36,9 @@ def add_commands(subparsers: Any) -> None:
     add = parser.add_argument_group("with --format gaussian-avatars").add_argument
     words = "background of the pictures (default: alpha, which stores the opacity)"
     add("--background", choices=("alpha", "white", "black"), default="alpha", help=words)
-    words = "masks without the torso, from the regions stage"
+    words = "write masks without the torso, from the regions stage"
     add("--head-only", action="store_true", help=words)
-    words = "make pictures N times smaller (default: 1)"
+    words = "make width and height of pictures N times smaller (default: 1)"
     add("--downscale", type=number(1), default=1, metavar="N", help=words)
     words = "divide out the cameras' colour gains that calibrate measured on a board"
     add("--even-colour", action="store_true", help=words)
@@ -50,7 +51,9 @@ def add_commands(subparsers: Any) -> None:
     parser = add_command(subparsers, "report", run_report, words)
     words = "folder of the page (default: DATASET/report)"
     parser.add_argument("--out", type=Path, metavar="FOLDER", help=words)
-    parser.add_argument("--title", metavar="TEXT", help="heading of the page")
+    parser.add_argument(
+        "--title", metavar="TEXT", help="heading of the page (default: the dataset's name)"
+    )
 
     area = subparsers.add_parser("head", help="draw a head model")
     actions = area.add_subparsers(dest="action", metavar="ACTION", required=True)

@@ -97,11 +97,11 @@ def add_commands(subparsers: Any) -> None:
     add = parser.add_argument
     words = "another measured dataset, of another size; may be repeated"
     add("--also", type=Path, action="append", default=[], metavar="DATASET", help=words)
-    add("--target", choices=list(TARGETS), help="plan a campaign of this dataset's size")
+    add("--target", choices=list(TARGETS), help="plan a campaign as large as this one")
     for name in SIZES:
         words = f"{name.replace('_', ' ')} of the campaign (default: --target's, else DATASET's)"
         add(f"--{name.replace('_', '-')}", type=number(1), metavar="N", help=words)
-    words = "picture size of the campaign's cameras, pixels"
+    words = "pictures of the campaign, pixels (default: --target's, else DATASET's)"
     add("--size", type=picture_size, metavar="WIDTHxHEIGHT", help=words)
     words = "cores to use (default: 1)"
     add("--workers", type=number(1), default=1, metavar="N", help=words)

@@ -41,13 +41,15 @@ def add_commands(subparsers: Any) -> None:
         "settings of a stage: express50 config STAGE",
     )  # fmt: skip
     _add_run_options(parser, captures=True)
-    parser.add_argument("--first", metavar="STAGE", choices=names, help="first stage to run")
-    parser.add_argument("--last", metavar="STAGE", choices=names, help="last stage to run")
+    for option, name in (("first", names[0]), ("last", names[-1])):
+        words = f"{option} stage to run (default: {name})"
+        parser.add_argument(f"--{option}", metavar="STAGE", choices=names, help=words)
+    without = "not with --preset, --first, --last or --print-job"
     words = "choose the settings that fit this time: 45m, 2h, 1h30m, or 40ch (core hours); "
-    words += "not with --preset or --print-job"
+    words += without
     parser.add_argument("--budget", metavar="TIME", help=words)
     words = "choose the quickest settings that reach this expected error, such as 0.5mm; "
-    words += "not with --preset or --print-job"
+    words += without
     parser.add_argument("--error", metavar="ERROR", help=words)
     for stage in stages().values():
         parser = add_command(
@@ -55,7 +57,8 @@ def add_commands(subparsers: Any) -> None:
             epilog=f"settings of the stage: express50 config {stage.name}",
         )  # fmt: skip
         _add_run_options(parser, captures=stage.prepare is not None)
-        parser.add_argument("--items", metavar="GLOB", help="only items that match, such as 'S00*'")
+        words = "only items that match, such as 'S00*' (default: all)"
+        parser.add_argument("--items", metavar="GLOB", help=words)
         parser.set_defaults(stage=stage.name)
     words = "print the settings of stages as TOML"
     parser = add_command(subparsers, "config", show_config, words, dataset=False, json=False)
@@ -87,16 +90,16 @@ def _add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: bo
     add_config_options(parser, preset)
     words = "local worker processes (default: 2); 0: work in this process"
     add("--workers", type=number(0), default=2, metavar="N", help=words)
-    add("--scheduler", metavar="ADDRESS", help="run on a dask scheduler, tcp://host:port")
+    add("--scheduler", metavar="ADDRESS", help="run on this dask scheduler: tcp://host:port")
     words = "run in SLURM jobs: partition=P,time=4:00:00,memory=16G,cores=4,jobs=8, or a TOML file"
     add("--slurm", type=str, metavar="JOBS", help=words)  # a type: ~ in its value is refused
     parser.set_defaults(print_job=False)
     if preset:
         words = "with --slurm: print the script of a job, and run nothing"
         add("--print-job", action="store_true", help=words)
-    words = "threads that an item may use (default: 1)"
+    words = "threads that each worker may use for its item (default: 1)"
     add("--threads", type=number(1), default=1, metavar="N", help=words)
-    words = "exit code 1 also if part of an item, such as a camera, was dropped"
+    words = "exit with code 1 also if part of an item, such as a camera, was dropped"
     add("--strict", action="store_true", help=words)
 
 
@@ -107,7 +110,7 @@ def add_config_options(parser: argparse.ArgumentParser, preset: bool = True) -> 
     if preset:
         add("--preset", metavar="PRESET", help=f"{', '.join(PRESETS)} (default: standard)")
     add("--config", type=Path, metavar="FILE", help="TOML file of settings, one table per stage")
-    words = "change one setting; may be repeated"
+    words = "change one setting, such as depth.voxel_mm=1.5; may be repeated"
     add("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help=words)
 
 

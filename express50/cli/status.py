@@ -88,7 +88,7 @@ def add_commands(subparsers: Any) -> None:
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print the receipts as JSON")
     how.add_argument("--page", type=Path, metavar="FILE", help=page)
-    serve = "serve the page, to this machine only"
+    serve = "serve the page on this port, to this machine only; 0: any free port"
     how.add_argument("--serve", type=number(0, 65535), metavar="PORT", help=serve)
 
 

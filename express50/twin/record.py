@@ -67,7 +67,8 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--no-hair", action="store_true", help="record bald subjects")
     parser.add_argument("--workers", type=number(1), metavar="N",
                         default=min(8, os.cpu_count() or 1),
-                        help="processes; their number does not change the result")  # fmt: skip
+                        help="processes; their number does not change the result (default: one per"
+                        " core, at most 8)")  # fmt: skip
 
 
 def record_command(args: argparse.Namespace) -> int:

@@ -76,26 +76,44 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--set": value(
         "TABLE.KEY=VALUE", "change one setting, such as train.lr=1e-3; may be repeated", **REPEATED
     ),
-    "--also": value("SHARDS", "another folder of shards; may be repeated", type=Path, **REPEATED),
+    "--also": value(
+        "SHARDS", "also train on this folder of shards; may be repeated", type=Path, **REPEATED
+    ),
     "--budget": value(
-        "TIME", "stop after this time: 60s, 4m, 2h", type=parse_seconds, dest="seconds"
+        "TIME",
+        "stop after this time: 60s, 4m, 2h; training also ends after train.iterations steps"
+        " (default: these steps alone)",
+        type=parse_seconds,
+        dest="seconds",
     ),
     "--holdout-cameras": value(
-        "ID,...", "cameras to hold out for testing, ids or patterns: cam02,cam05", default=""
+        "ID,...",
+        "cameras to hold out for testing, ids or patterns: cam02,cam05 (default: none)",
+        default="",
     ),
     "--holdout-expressions": value(
         "SUBJECT/EXPRESSION,...",
-        "expressions to hold out for testing, ids or patterns: S002/smile",
+        "expressions to hold out for testing, ids or patterns: S002/smile (default: none)",
         default="",
     ),
     "--paper-diff": flag("print the differences from the paper instead"),
     "--overwrite": flag("start over even if OUT has a checkpoint"),
     # Measuring
-    "--alexnet": value("FILE", "torchvision's alexnet state dict, for LPIPS", default=""),
-    "--inception": value("FILE", "Inception as TorchScript, for FID", default=""),
-    "--subjects": value("ID,...", "only these, ids or patterns: S001,S002", default="*"),
-    "--expressions": value("ID,...", "only these, ids or patterns: smile,jaw*", default="*"),
-    "--cameras": value("ID,...", "only these, ids or patterns: cam02,cam05", default="*"),
+    "--alexnet": value(
+        "FILE", "torchvision's alexnet state dict, for LPIPS (default: LPIPS is n/a)", default=""
+    ),
+    "--inception": value(
+        "FILE", "Inception as TorchScript, for FID (default: FID is n/a)", default=""
+    ),
+    "--subjects": value(
+        "ID,...", "only these, ids or patterns: S001,S002 (default: all)", default="*"
+    ),
+    "--expressions": value(
+        "ID,...", "only these, ids or patterns: smile,jaw* (default: all)", default="*"
+    ),
+    "--cameras": value(
+        "ID,...", "only these, ids or patterns: cam02,cam05 (default: all)", default="*"
+    ),
     "--images": value(
         "N",
         "measure at most this many images, evenly spread; for fitted people, the limit is per"
@@ -109,12 +127,16 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "ID,...", "people to fit (default: everyone that training did not see)", default=""
     ),
     "--fit-cameras": value(
-        "ID,...", "fit people that training did not see from these cameras", default=""
+        "ID,...",
+        "fit people that training did not see from these cameras (default: fit nobody)",
+        default="",
     ),
     "--fit-expression": value(
         "ID", "fit these people from this expression (default: %(default)s)", default="neutral"
     ),
-    "--fit-budget": value("TIME", "time per fit: 60s, 5m", type=parse_seconds),
+    "--fit-budget": value(
+        "TIME", "time per fit: 60s, 5m (default: all steps of the fit)", type=parse_seconds
+    ),
     "--background": value(
         "GREY",
         "grey behind the pictures, 0 to 1 (default: 0)",
@@ -148,14 +170,18 @@ OPTIONS: dict[str, dict[str, Any]] = {
         " deviations along a principal direction); may be repeated",
         **REPEATED,
     ),
-    "--camera": value("ID", "camera of the checkpoint (default: a frontal one)"),
+    "--camera": value("ID", "camera of the checkpoint to draw from (default: a frontal one)"),
     "--size": value(
         "N", "longer side, pixels (default: as trained)", type=number(0, MOST_PX), default=0
     ),
-    "--yaw": value("DEG", "move the camera around the head, degrees", type=ANGLE, default=0.0),
-    "--pitch": value("DEG", "move the camera up, degrees", type=ANGLE, default=0.0),
+    "--yaw": value(
+        "DEG", "move the camera around the head, degrees (default: 0)", type=ANGLE, default=0.0
+    ),
+    "--pitch": value("DEG", "move the camera up, degrees (default: 0)", type=ANGLE, default=0.0),
     "--turntable": flag("write turntable.mp4"),
-    "--degrees": value("DEG", "angle that the turntable covers (default: 360)", type=ANGLE),
+    "--degrees": value(
+        "DEG", "angle that the turntable covers, degrees (default: 360)", type=ANGLE
+    ),
     "--frames": value(
         "N",
         f"frames of turntable or interpolation (default: {commands.VIDEO_FRAMES})",
@@ -165,11 +191,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--drive": value(
         "SEQUENCE.NPZ", "write driven.mp4: the head moves as in these tracked clips", type=Path
     ),
-    "--drive-cue": value("ID", "use only this clip of --drive"),
+    "--drive-cue": value("ID", "use only this clip of --drive (default: all)"),
     "--views": flag("write views.jpg: novel views"),
     "--controls": flag("write controls.jpg: one control changed at a time"),
     "--samples": value(
-        "N", "write samples.jpg with this many new heads", type=number(0), default=0
+        "N", "write samples.jpg with this many new heads (default: 0)", type=number(0), default=0
     ),
     "--spread": value(
         "FACTOR",
@@ -195,7 +221,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "N", "port to listen on (default: %(default)s)", type=number(1, 65535), default=8080
     ),
     # Studies
-    "--reference": value("FOLDER", "true pictures", type=Path, required=True),
+    "--reference": value("FOLDER", "pictures of the footage", type=Path, required=True),
     "--ours": value(
         "FOLDER", "one method's pictures, with the same names", type=Path, required=True
     ),
@@ -268,7 +294,10 @@ COMMANDS = {
                 "metavar": "fit.KEY=VALUE",
                 "help": "change one setting of the fit; may be repeated",
             },
-            "--overwrite": {"help": "replace the fit in OUT"},
+            "--budget": {
+                "help": "stop after this time: 60s, 4m, 2h (default: after all steps of the fit)"
+            },
+            "--overwrite": {"help": "start over even if OUT has a fit"},
         },
     ),
     "config": GrmmCommand(

@@ -28,14 +28,15 @@ def add_commands(subparsers: Any) -> None:
 
     parser = add_command(
         subparsers, "photo", run_photo, WORDS, dataset=False,
-        example="express50 photo portrait.jpg out\npictures of the result: out/track/portrait/qc",
+        example="express50 photo portrait.jpg out\npicture of the result: out/panels/portrait/panel.jpg",
     )  # fmt: skip
     parser.add_argument("picture", type=Path, metavar="PICTURE", help="image or video file")
     parser.add_argument("out", type=Path, metavar="OUT", help="dataset to make or extend")
     parser.add_argument("--subject", metavar="ID", help="subject's id (default: the file's name)")
     lens = parser.add_mutually_exclusive_group()
     length = number(1, kind=float)
-    lens.add_argument("--focal-px", type=length, metavar="PX", help="focal length, pixels")
+    words = "focal length, pixels (default: from EXIF, else by --film-mm)"
+    lens.add_argument("--focal-px", type=length, metavar="PX", help=words)
     lens.add_argument(
         "--film-mm", type=length, default=50.0, metavar="MM",
         help="focal length to assume if EXIF has none, mm on 35 mm film (default: 50)",
