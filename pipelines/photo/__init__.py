@@ -28,7 +28,8 @@ def add_commands(subparsers: Any) -> None:
 
     parser = add_command(
         subparsers, "photo", run_photo, WORDS, dataset=False,
-        example="express50 photo portrait.jpg out\npicture of the result: out/panels/portrait/panel.jpg",
+        example="express50 photo portrait.jpg out\n"
+        "picture of the result: out/panels/portrait/panel.jpg",
     )  # fmt: skip
     parser.add_argument("picture", type=Path, metavar="PICTURE", help="image or video file")
     parser.add_argument("out", type=Path, metavar="OUT", help="dataset to make or extend")
