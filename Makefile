@@ -1,4 +1,4 @@
-# One target per stage; `make demo` runs them all on a small synthetic capture.
+# One target per stage; `make demo` runs them all on small synthetic captures.
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
@@ -31,7 +31,7 @@ $(READY): pyproject.toml constraints.txt setup.py scripts/system_libs.sh $(wildc
 	$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
 	touch $@
 
-demo: $(READY) ## run everything on a synthetic capture (or CAPTURES="dir ..."): build/demo/report/index.html
+demo: $(READY) ## run everything on synthetic captures (or CAPTURES="dir dir ..."): build/demo/report/index.html
 	$(BIN)/python -m benchmarks.demo build/demo $(if $(CAPTURES),--captures $(CAPTURES)) --workers $(WORKERS)
 
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
@@ -67,7 +67,7 @@ run: $(READY) ## run every stage on CAPTURES="dir ..." in DATASET, with settings
 tune: $(READY) ## measure the error of the whole chain against its time on DATASET
 	$(BIN)/express50 tune $(DATASET) $(CAPTURES) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
 
-train: $(READY) ## train GRMM on DATASET's shards for an hour, or continue; the preset suits the machine
+train: $(READY) ## train GRMM on DATASET's shards for at most an hour, or continue; the preset suits the machine
 	$(BIN)/grmm train $(DATASET)/pack/shards $(DATASET)/grmm $(TRAIN)
 
 report: $(READY) ## write one HTML page of DATASET's results and pictures

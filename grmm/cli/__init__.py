@@ -132,10 +132,14 @@ OPTIONS: dict[str, dict[str, Any]] = {
         default="",
     ),
     "--fit-expression": value(
-        "ID", "fit these people from this expression (default: %(default)s)", default="neutral"
+        "ID",
+        "with --fit-cameras: fit from this expression (default: %(default)s)",
+        default="neutral",
     ),
     "--fit-budget": value(
-        "TIME", "time per fit: 60s, 5m (default: all steps of the fit)", type=parse_seconds
+        "TIME",
+        "with --fit-cameras: time per fit, 60s, 5m (default: all steps of the fit)",
+        type=parse_seconds,
     ),
     "--background": value(
         "GREY",
@@ -180,18 +184,18 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--pitch": value("DEG", "move the camera up, degrees (default: 0)", type=ANGLE, default=0.0),
     "--turntable": flag("write turntable.mp4"),
     "--degrees": value(
-        "DEG", "angle that the turntable covers, degrees (default: 360)", type=ANGLE
+        "DEG", "with --turntable: angle to cover, degrees (default: 360)", type=ANGLE
     ),
     "--frames": value(
         "N",
-        f"frames of turntable or interpolation (default: {commands.VIDEO_FRAMES})",
+        f"with --turntable or --to: frames of the video (default: {commands.VIDEO_FRAMES})",
         type=number(1),
     ),
     "--to": value("SUBJECT/EXPRESSION", "write interpolation.mp4, which ends at this expression"),
     "--drive": value(
         "SEQUENCE.NPZ", "write driven.mp4: the head moves as in these tracked clips", type=Path
     ),
-    "--drive-cue": value("ID", "use only this clip of --drive (default: all)"),
+    "--drive-cue": value("ID", "with --drive: use only this clip (default: all)"),
     "--views": flag("write views.jpg: novel views"),
     "--controls": flag("write controls.jpg: one control changed at a time"),
     "--samples": value(
@@ -199,7 +203,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     ),
     "--spread": value(
         "FACTOR",
-        "spread of the samples (default: 1, as in training)",
+        "with --samples: their spread (default: 1, as in training)",
         type=number(0, 100, float),
     ),
     "--seed": value("N", "random seed (default: 0)", type=number(0)),
@@ -313,7 +317,10 @@ COMMANDS = {
         help="draw a head, optionally edited, as pictures, sheets or videos",
         example="grmm render run/checkpoint.pt pictures --subject S002 --turntable --views \\\n"
         "      --expression-of S001/smile --control jaw.0=0.2",
-        changes={"out": {"help": "folder for pictures and videos"}},
+        changes={
+            "out": {"help": "folder for pictures and videos"},
+            "--seed": {"help": "with --samples: random seed (default: 0)"},
+        },
     ),
     "export": GrmmCommand(
         handler=commands.export,
