@@ -120,3 +120,10 @@ def test_examples_of_a_capture_can_be_read(tmp_path):
     table = tomllib.loads((tmp_path / "board.toml").read_text())
     assert board_from_table(table, "board.toml").squares_x == 7
     assert read_cameras(tmp_path / "calibration.json")["cam00"].width == 1920
+
+
+def test_names_that_the_guide_imports_exist():
+    blocks = re.findall(r"```python\n(.*?)```", (PAGE.parent / "GUIDE.md").read_text(), re.DOTALL)
+    assert len(blocks) == 2
+    for block in blocks:
+        exec("\n".join(line for line in block.splitlines() if line.startswith("from ")), {})
