@@ -13,6 +13,7 @@ import torch
 
 from express50.capture.demographics import PUBLIC_KEYS
 from express50.capture.raw import read_cues, read_meta
+from express50.capture.readers.read import Layout
 from express50.capture.readers.selection import Selection
 from express50.contract.stage import Stage
 from express50.files.calibration import read_cameras
@@ -53,7 +54,10 @@ def test_reader(tmp_path):
     assert not made["fits"](rig)
     (rig / "rig.json").write_text("{}")
     assert made["fits"](rig)
-    capture = made["read"](rig, Selection())
+    (row,) = re.findall(r"`(Layout\(.*?\))`", PAGE.read_text(encoding="utf-8"))
+    layout = eval(row, {"Layout": Layout, "myrig": SimpleNamespace(**made)})
+    assert layout.fits(rig) and layout.subject_of(rig) == "S100"
+    capture = layout.read(rig, Selection())
     assert capture.subject == "S100" and set(capture.cameras) == {"left", "right"}
     assert capture.clips == ("smile",)
 
