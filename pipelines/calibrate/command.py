@@ -62,7 +62,7 @@ def add_commands(subparsers: Any) -> None:
         add = action.add_argument
         words = f"format of SOURCE: {', '.join(FORMATS)} (default: recognised)"
         add("--format", choices=FORMATS, metavar="NAME", help=words)
-        words = "size of the footage, pixels; K is scaled to it"
+        words = "size of the footage, pixels, to which K is scaled (default: as in SOURCE)"
         add("--size", type=picture_size, metavar="WIDTHxHEIGHT", help=words)
         words = "metres per unit of SOURCE's world (default: 1)"
         add("--scale", type=number(1e-9, kind=float), default=1.0, metavar="METRES", help=words)
