@@ -10,7 +10,7 @@ from typing import Any
 from express50.console import FAILED, OK, add_command, log, number, say, say_json, stdout_to_stderr
 from express50.contract.layout import Dataset, check_results_folder
 from express50.contract.stage import Command, stages
-from express50.errors import ConfigError
+from express50.errors import ConfigError, advised
 from express50.files.text import ID
 
 STAGES = ("ingest", "calibrate", "observe", "align", "frames", "matte", "track")
@@ -19,6 +19,7 @@ PHOTO_SETTINGS = (
     "observe.min_score=0.2", f"track.search={SEARCH}", f"observe.search={SEARCH}",
     "matte.method=grabcut",
 )  # fmt: skip
+WALK = 40  # pictures, of all around a head one every 8 degrees
 WORDS = "track the face in a single photograph or video, without calibration"
 
 
@@ -47,6 +48,11 @@ def add_commands(subparsers: Any) -> None:
         help="frames of a video that fit the head's shape, evenly spread (default: 8)",
     )  # fmt: skip
     parser.add_argument(
+        "--walk", type=number(3), nargs="?", const=WALK, metavar="N",
+        help="the video was walked around a person who holds still: only write its sharpest N"
+        f" pictures (default: {WALK}), as cameras of one moment for 'express50 run'",
+    )  # fmt: skip
+    parser.add_argument(
         "--matte",
         action="store_true",
         help="also make a matte and fit outlines: by colours around the face, or with your network"
@@ -68,10 +74,6 @@ def run_photo(args: argparse.Namespace) -> int:
     if args.subject is not None and not ID.fullmatch(args.subject):
         raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
     picture = open_picture(args.picture)
-    if picture.profile is not None:
-        log(f"{picture.path}: its colours are converted from {picture.profile.name!r} to sRGB")
-    clips, given = ("track.frames=clips",) if picture.video else (), args.set
-    args.set = [*PHOTO_SETTINGS, *clips, *given]
     cap_threads(1)
     subject = args.subject or subject_id(args.picture)
     dataset = Dataset(args.out)
@@ -84,6 +86,12 @@ def run_photo(args: argparse.Namespace) -> int:
             f"{args.out}: subject {subject} already has the capture {known}; give the picture"
             " another id with --subject, or name another OUT"
         )
+    if args.walk:
+        return walk(args, folder, subject)
+    if picture.profile is not None:
+        log(f"{picture.path}: its colours are converted from {picture.profile.name!r} to sRGB")
+    clips, given = ("track.frames=clips",) if picture.video else (), args.set
+    args.set = [*PHOTO_SETTINGS, *clips, *given]
     names = [name for name in STAGES if args.matte or name != "matte"]
     with stdout_to_stderr() if args.json else nullcontext():
         loaded = [stages()[name] for name in names]
@@ -119,6 +127,31 @@ def run_photo(args: argparse.Namespace) -> int:
     if not summaries[-1].ok:
         return FAILED
     say(f"track: {dataset.item_dir('track', subject)}", f"picture: {panel}")
+    return OK
+
+
+def walk(args: argparse.Namespace, folder: Path, subject: str) -> int:
+    """Write the capture of a video that was walked around a person; no stage runs.
+
+    Raises:
+        ConfigError: the file is not a video, or an option belongs to the stages.
+    """
+    from pipelines.photo.capture import open_picture, write_walk_capture
+
+    video = open_picture(args.picture)
+    if not video.video:
+        raise ConfigError(f"--walk: {video.path} is a photograph, expected a video")
+    if args.matte or args.set or args.config or args.preset:
+        raise ConfigError(
+            "--walk only writes pictures; give --set, --config and --preset to 'express50 run',"
+            " which makes mattes too"
+        )
+    frames = write_walk_capture(video, folder, subject, args.walk, args.focal_px)
+    if args.json:
+        say_json({"capture": str(folder), "frames": frames})
+    else:
+        say(f"pictures: {len(frames)} in {folder}")
+        say(f"next: {advised('express50 run', args.out, folder)}")
     return OK
 
 

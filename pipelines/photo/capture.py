@@ -1,5 +1,6 @@
-"""Make a raw capture of one camera out of a photograph or a video, its focal length included.
+"""Make a raw capture out of a photograph or a video: of one camera, or of one that walked around.
 
+The focal length of one camera is found too.
 Only perspective distinguishes a near face under a wide lens from a far one under a long lens. The
 head model is fitted at a ladder of focal lengths; the fit's cost shows which of them explain the
 landmarks as well as the best one does.
@@ -43,7 +44,7 @@ from express50.files.text import no_file
 from express50.files.video import VideoFootage, iterate_video, video_fps, video_tags
 from express50.geometry.cameras import Camera, pinhole_camera
 from express50.geometry.conventions import FLIP_YZ
-from express50.geometry.sampling import evenly
+from express50.geometry.sampling import edge_width, evenly
 from express50.head.load import load_head
 from express50.head.model import landmarks_of
 from express50.head.preview import render_preview
@@ -231,15 +232,51 @@ def make_photo_capture(
     return PhotoCapture(focal, search)
 
 
-def _check_folder(folder: Path, picture: Path, digest: str) -> None:
+def write_walk_capture(
+    video: PhotoSource, folder: Path, subject: str, count: int, focal_px: float | None = None
+) -> list[int]:
+    """Write the sharpest frame of each of `count` parts of a video, as cameras of one moment.
+
+    The video was walked around a person who holds still, so that all frames have one lens. Returns
+    the frames' numbers, which name the files.
+
+    Raises:
+        CaptureError: the video cannot be read or is too short, or the folder has another picture.
+    """
+    digest = file_sha256(video.path)
+    _check_folder(folder, video.path, digest, walked=True)
+    widths = [edge_width(image) or math.inf for image in upright_frames(video)]
+    if len(widths) < count:
+        raise CaptureError(
+            f"{video.path}: has {len(widths)} frames, expected {count} or more; give a smaller"
+            " number with --walk, or a longer video"
+        )
+    edges = np.linspace(0, len(widths), count + 1).round().astype(int)
+    parts = zip(edges[:-1], edges[1:], strict=True)
+    chosen = [int(first + np.argmin(widths[first:end])) for first, end in parts]
+    lines = [f'subject = "{subject}"', "same_lens = true", f'picture_sha256 = "{digest}"']
+    lines += [f"focal_px = {focal_px:.3f}"] if focal_px else []
+    write_bytes(folder / "capture.toml", "\n".join([*lines, ""]).encode())
+    for earlier in folder.glob("*.jpg"):
+        earlier.unlink()
+    for number, image in enumerate(upright_frames(video)):
+        if number in chosen:
+            write_image(folder / f"{number:05d}.jpg", image)
+    return chosen
+
+
+def _check_folder(folder: Path, picture: Path, digest: str, walked: bool = False) -> None:
     """Raise CaptureError if a folder holds anything but the capture of this picture."""
     if not folder.is_dir() or not any(folder.iterdir()):
         return
-    known = None
+    table = dict[str, object]()
     with suppress(OSError, ValueError):
-        known = tomllib.loads((folder / "capture.toml").read_text()).get("picture_sha256")
-    if known != digest:
+        table = tomllib.loads((folder / "capture.toml").read_text())
+    known = table.get("picture_sha256")
+    if known != digest or table.get("same_lens", False) != walked:
         other = "was made from another picture" if known else "is not a capture of this picture"
+        if known == digest:
+            other = f"was made with{'out' if walked else ''} --walk"
         raise CaptureError(
             f"{picture}: {folder} {other}; name this one with --subject, or remove that folder"
         )

@@ -13,6 +13,8 @@ import pytest
 import torch
 
 from express50.__main__ import main
+from express50.capture.index import read_index
+from express50.contract.layout import Dataset
 from express50.errors import CaptureError
 from express50.files.atomic import write_json
 from express50.files.calibration import read_cameras
@@ -21,6 +23,7 @@ from express50.files.images import write_image
 from express50.files.video import iterate_video
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
+from pipelines.calibrate.footage import has_one_lens
 from pipelines.photo import capture
 from pipelines.photo.capture import find_faces, make_photo_capture, open_picture, subject_id
 from pipelines.track.config import TrackConfig
@@ -124,6 +127,28 @@ def test_wrong_options_and_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "c.png").write_text("no picture")
     with pytest.raises(CaptureError, match="cannot be read"):
         open_picture(tmp_path / "c.png")
+
+
+def test_a_walk_around_a_person_gives_its_sharpest_pictures_as_one_rig(tmp_path, capsys) -> None:
+    scene = cv2.resize(data.astronaut(), (640, 640))
+    images = [scene[:480, 4 * n : 4 * n + 320] for n in range(20)]
+    blurred = [cv2.blur(image, (1, 9)) for image in images]
+    film = [images[n] if n % 5 == 3 else blurred[n] for n in range(20)]
+    write_video(tmp_path / "walk.mp4", film)
+    out, walk = tmp_path / "out", ["photo", str(tmp_path / "walk.mp4"), str(tmp_path / "out")]
+    assert main([*walk, "--walk", "2"]) == 2 and main([*walk, "--walk", "21"]) == 1
+    assert "has 20 frames, expected 21" in capsys.readouterr().err
+    for count in (5, 4):  # the second replaces the first
+        assert main([*walk, "--walk", str(count), "--focal-px", "500"]) == 0
+    pictures = sorted(path.name for path in (out / "photos/walk").glob("*.jpg"))
+    assert pictures == [f"{n:05d}.jpg" for n in (3, 8, 13, 18)]
+    assert str(out / "photos/walk") in capsys.readouterr().out
+    assert main(["ingest", str(out), str(out / "photos/walk")]) == 0
+    index = read_index(Dataset(out), "walk")
+    assert [*index.cameras] == ["00003", "00008", "00013", "00018"]
+    assert has_one_lens(index) and index.meta["focal_px"] == 500
+    assert main(walk) == 1 and "was made with --walk" in capsys.readouterr().err
+    assert main([*walk, "--walk", "--matte"]) == 2
 
 
 def test_a_second_picture_of_the_same_name_takes_nobodys_place(
