@@ -240,6 +240,12 @@ def _odd_video(source: CameraSource, tags: VideoTags) -> list[str]:
             oddities.append(
                 f"variable frame rate ({share:.0%} of the steps); record at a constant rate"
             )
+    return oddities + odd_tags(tags)
+
+
+def odd_tags(tags: VideoTags) -> list[str]:
+    """Say what is unusual about a video's pictures, with what to do."""
+    oddities = []
     if tags.hdr:
         oddities.append(
             f"HDR ({tags.hdr}), but read as sRGB, so the colours are wrong; record without HDR,"

@@ -136,6 +136,8 @@ def walk(args: argparse.Namespace, folder: Path, subject: str) -> int:
     Raises:
         ConfigError: the file is not a video, or an option belongs to the stages.
     """
+    from express50.files.video import video_tags
+    from pipelines.ingest.scan import odd_tags
     from pipelines.photo.capture import open_picture, write_walk_capture
 
     video = open_picture(args.picture)
@@ -146,6 +148,8 @@ def walk(args: argparse.Namespace, folder: Path, subject: str) -> int:
             "--walk only writes pictures; give --set, --config and --preset to 'express50 run',"
             " which makes mattes too"
         )
+    for odd in odd_tags(video_tags(video.path)):
+        log(f"warning: {video.path}: {odd}")
     frames = write_walk_capture(video, folder, subject, args.walk, args.focal_px)
     if args.json:
         say_json({"capture": str(folder), "frames": frames})

@@ -15,7 +15,7 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 
 import cv2
@@ -41,7 +41,13 @@ from express50.files.images import (
     write_image,
 )
 from express50.files.text import no_file
-from express50.files.video import VideoFootage, iterate_video, video_fps, video_tags
+from express50.files.video import (
+    VideoFootage,
+    frame_times,
+    iterate_video,
+    video_fps,
+    video_tags,
+)
 from express50.geometry.cameras import Camera, pinhole_camera
 from express50.geometry.conventions import FLIP_YZ
 from express50.geometry.sampling import edge_width, evenly
@@ -245,23 +251,25 @@ def write_walk_capture(
     """
     digest = file_sha256(video.path)
     _check_folder(folder, video.path, digest, walked=True)
-    widths = [edge_width(image) or math.inf for image in upright_frames(video)]
-    if len(widths) < count:
+    frames = len(frame_times(video.path))
+    if frames < count:
         raise CaptureError(
-            f"{video.path}: has {len(widths)} frames, expected {count} or more; give a smaller"
-            " number with --walk, or a longer video"
+            f"{video.path}: has {frames} frames, expected {count} or more; give a smaller number"
+            " with --walk, or a longer video"
         )
-    edges = np.linspace(0, len(widths), count + 1).round().astype(int)
-    parts = zip(edges[:-1], edges[1:], strict=True)
-    chosen = [int(first + np.argmin(widths[first:end])) for first, end in parts]
     lines = [f'subject = "{subject}"', "same_lens = true", f'picture_sha256 = "{digest}"']
     lines += [f"focal_px = {focal_px:.3f}"] if focal_px else []
     write_bytes(folder / "capture.toml", "\n".join([*lines, ""]).encode())
     for earlier in folder.glob("*.jpg"):
         earlier.unlink()
-    for number, image in enumerate(upright_frames(video)):
-        if number in chosen:
-            write_image(folder / f"{number:05d}.jpg", image)
+    chosen, images = [], upright_frames(video)
+    edges = np.linspace(0, frames, count + 1).round().astype(int).tolist()
+    for first, end in pairwise(edges):
+        part = zip(range(first, end), images, strict=False)
+        found = min(part, key=lambda one: edge_width(one[1]) or math.inf, default=None)
+        if found is not None:  # a video may hold fewer frames than it says
+            write_image(folder / f"{found[0]:05d}.jpg", found[1])
+            chosen.append(found[0])
     return chosen
 
 
