@@ -254,10 +254,10 @@ def _with_parameter(
 
 def _numbers(values: Sequence[float], size: int, name: str) -> Sequence[float]:
     if len(values) != size:
-        one = f", or {name}.0 to {name}.{size - 1} with one" if "." not in name else ""
+        many = f" with commas between, or {name}.0 to {name}.{size - 1} with one"
         raise ConfigError(
-            f"control {name}: got {count(len(values), 'number')}, expected {size} with commas"
-            f" between{one}"
+            f"control {name}: got {count(len(values), 'number')}, expected {size}"
+            + (many if size > 1 else "")
         )
     return values
 

@@ -132,9 +132,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         default="",
     ),
     "--fit-expression": value(
-        "ID",
-        "with --fit-cameras: fit from this expression (default: %(default)s)",
-        default="neutral",
+        "ID", "with --fit-cameras: fit from this expression (default: neutral)"
     ),
     "--fit-budget": value(
         "TIME",
@@ -246,9 +244,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 ALIASES = {"--budget": ["--seconds"]}
 
 METRICS = "--alexnet --inception"
-TRAINING = (
-    f"--preset --config --set --also --budget --holdout-cameras --holdout-expressions {METRICS}"
-)
+SETTINGS = f"--preset --config --set --budget --holdout-cameras --holdout-expressions {METRICS}"
 CHOICE = "--subjects --expressions --cameras --images"
 PROTOCOL = "--fit-cameras --fit-expression --fit-budget"
 EDIT = "--subject --expression --expression-of --z-id-of --z-exp-of --control --camera"
@@ -268,7 +264,7 @@ class GrmmCommand:
 COMMANDS = {
     "train": GrmmCommand(
         handler=commands.train,
-        options=f"shards out {TRAINING} --overwrite --json",
+        options=f"shards out --also {SETTINGS} --overwrite --json",
         help="train on packed shards",
         example="grmm train data/pack/shards run --preset demo --budget 4m\n"
         "the same command again continues from run/checkpoint.pt",
@@ -306,7 +302,7 @@ COMMANDS = {
     ),
     "config": GrmmCommand(
         handler=commands.config,
-        options=f"table {TRAINING} --paper-diff",
+        options=f"table {SETTINGS} --paper-diff",
         help="print every setting with its meaning, in the form that --config reads",
         example="grmm config train fit --preset demo",
     ),
@@ -368,8 +364,8 @@ COMMANDS = {
     ),
     "ablate": GrmmCommand(
         handler=commands.ablate,
-        options=f"shards out {TRAINING} --rows --seeds --test --fit-subjects --images {PROTOCOL}"
-        " --json",
+        options=f"shards out --also {SETTINGS} --rows --seeds --test --fit-subjects --images"
+        f" {PROTOCOL} --json",
         help="train and measure the paper's ablations under one budget",
         example="grmm ablate express/pack/shards out --also renderme/pack/shards \\\n"
         "      --preset small --budget 2h --fit-cameras cam03 --fit-budget 60s",

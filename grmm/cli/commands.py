@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from express50.console import FAILED, OK, answer, count, figure_label, log, say
 from express50.contract.config import config_toml, known_assignments
 from express50.contract.layout import check_results_file, check_results_folder
-from express50.errors import ConfigError, FormatError, check_known
+from express50.errors import ConfigError, FormatError, check_known, few
 from express50.files.atomic import alone_in, check_space, dump_json, write_bytes, write_json
 from express50.files.digests import file_sha256
 from grmm.config import TABLES, Config, as_tables, choose, from_tables, resolve
@@ -114,6 +114,8 @@ def config(args: argparse.Namespace) -> int:
     """Print the settings that `train` would take, as TOML."""
     resolved = train_config(args)
     if args.paper_diff:
+        if args.table:
+            raise ConfigError(f"--paper-diff is of all tables; leave out {' '.join(args.table)}")
         say(*paper_diff(resolved))
         return OK
     check_known("grmm config", "table", args.table, TABLES)
@@ -290,7 +292,7 @@ def evaluate(args: argparse.Namespace) -> int:
     _check_evaluation_folder(args.out)
     if args.save:
         check_results_folder(args.save)
-    _require(args, "fit_cameras", "fit_budget")
+    _require(args, "fit_cameras", "fit_budget", "fit_expression")
     loaded = _load(args.checkpoint, _metric_settings(args), args.fit_budget)
     if args.fit_cameras and loaded.seen_before is not None:
         raise ConfigError(
@@ -315,23 +317,24 @@ def evaluate(args: argparse.Namespace) -> int:
         trained = loaded.model.expressions
         _, unseen[subject] = unseen_views(trained, views, subject, protocol, chosen)
     fits = args.out / FITS
-    journal = _journal(args, loaded, source.digest, protocol, fits)
-    # After a stop, pictures are from this command.
-    new = [] if journal_rows(journal) else [*known, *chain.from_iterable(unseen.values())]
-    keep = save_pictures(args.save, source.window, views, new) if args.save else None
-    fits.mkdir(parents=True, exist_ok=True)
-    check_space(fits)  # before anybody is measured for nothing
-    render = training_render(loaded.model, views)
-    log(f"measuring {count(len(known), 'image')} of people with codes")
-    rows = evaluate(views, known, render, judge, kind, keep, journal)
-    for subject, chosen in unseen.items():
-        found, effort = evaluate_unseen(
-            loaded, views, subject, protocol, judge, keep, chosen, fits, journal
-        )
-        log(f"{subject}: fitted from {', '.join(effort['cameras'])} in {effort['seconds']} s")
-        rows += found
-    code = _report(args, rows, judge)
-    shutil.rmtree(fits, ignore_errors=True)  # only a stopped command needs them
+    with alone_in(args.out):  # the other one would delete the fits of this
+        journal = _journal(args, loaded, source.digest, protocol, fits)
+        # After a stop, pictures are from this command.
+        new = [] if journal_rows(journal) else [*known, *chain.from_iterable(unseen.values())]
+        keep = save_pictures(args.save, source.window, views, new) if args.save else None
+        fits.mkdir(parents=True, exist_ok=True)
+        check_space(fits)  # before anybody is measured for nothing
+        render = training_render(loaded.model, views)
+        log(f"measuring {count(len(known), 'image')} of people with codes")
+        rows = evaluate(views, known, render, judge, kind, keep, journal)
+        for subject, chosen in unseen.items():
+            found, effort = evaluate_unseen(
+                loaded, views, subject, protocol, judge, keep, chosen, fits, journal
+            )
+            log(f"{subject}: fitted from {', '.join(effort['cameras'])} in {effort['seconds']} s")
+            rows += found
+        code = _report(args, rows, judge)
+        shutil.rmtree(fits, ignore_errors=True)  # only a stopped command needs them
     return code
 
 
@@ -364,12 +367,17 @@ def _split(
     unseen = {name: [i for i in chosen if keys[i].subject == name] for name in strangers}
     known = [i for i in chosen if keys[i].subject not in unseen]
     known = with_codes(keys, known, model.subjects, model.expressions)
+    if not known and not unseen:
+        names = few(sorted({keys[i].expression for i in chosen}))
+        raise ConfigError(
+            f"{args.shards}: the checkpoint has no codes of {names};"
+            f" choose among the expressions that were trained: {few(model.expressions)}"
+        )
     if args.fit_cameras:
         return known, unseen
     if not known:
         raise ConfigError(
-            f"{args.shards}: the checkpoint has no codes of "
-            f"{', '.join(unseen) or args.expressions}; "
+            f"{args.shards}: the checkpoint has no codes of {', '.join(unseen)}; "
             "give --fit-cameras, with a checkpoint of 'grmm train', to fit such people first"
         )
     if unseen:
@@ -442,7 +450,9 @@ def _protocol(args: argparse.Namespace) -> FitProtocol:
     from grmm.fit import FitProtocol
 
     return FitProtocol(
-        cameras=_split_names(args.fit_cameras), expression=args.fit_expression, images=args.images
+        cameras=_split_names(args.fit_cameras),
+        expression=args.fit_expression or FitProtocol.expression,
+        images=args.images,
     )
 
 
@@ -515,6 +525,8 @@ def _edited_head(loaded: Checkpoint, args: argparse.Namespace) -> HeadCodes:
     """Build the head that the arguments describe: a training head, then its edits."""
     from grmm.edit import controlled, trained_head, with_expression
 
+    if args.expression and args.expression_of:
+        raise ConfigError("--expression and --expression-of: give only one of them")
     head = trained_head(loaded, *_frame(loaded, args.subject, args.expression))
     if args.expression_of:
         head = with_expression(head, _frame_head(loaded, args.expression_of))

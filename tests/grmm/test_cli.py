@@ -173,6 +173,11 @@ def test_held_out_expressions_without_a_code_are_named(shards, tmp_path, capsys)
     assert main(["evaluate", checkpoint, str(shards), out, *fitted]) == 0
     said = capsys.readouterr().err
     assert said.count("cannot be measured") == 1 and "trained or fitted: S002/e0\n" in said
+    evaluate = ["evaluate", checkpoint, str(shards), out, "--subjects=S000", "--expressions=e0"]
+    for more in ([], ["--fit-cameras=cam00"]):  # which fits only people without codes
+        assert main([*evaluate, *more]) == 2
+        words = "the checkpoint has no codes of e0; choose among the expressions that were trained"
+        assert f"{words}: e1" in capsys.readouterr().err
 
 
 def test_render_writes_a_picture_per_frame_and_pair(checkpoint, tmp_path, capsys):
@@ -708,7 +713,11 @@ def test_only_the_first_process_reports(shards, tmp_path, monkeypatch, capsys):
         ["render", "{0}", "pictures", "--spread=2"],
         ["render", "{0}", "pictures", "--seed=0"],
         ["render", "{0}", "pictures", "--frames=9"],
+        ["render", "{0}", "pictures", "--expression=e1", "--expression-of=S001/e0"],
+        ["export", "{0}", "head.ply", "--expression=e1", "--expression-of=S001/e0"],
         ["evaluate", "{0}", "{1}", "out", "--fit-budget=5s"],
+        ["evaluate", "{0}", "{1}", "out", "--fit-expression=e0"],
+        ["config", "train", "--paper-diff"],
     ],
 )
 def test_options_that_would_do_nothing_are_refused(
@@ -743,8 +752,11 @@ def test_the_command_reads_its_own_arguments(monkeypatch, capsys):
     assert "[model]" in capsys.readouterr().out
 
 
-def test_two_trainings_into_one_folder_are_refused(shards, tmp_path, capsys):
+@pytest.mark.parametrize("command", [["train"], ["evaluate", "{}"]])
+def test_two_commands_into_one_folder_are_refused(command, checkpoint, shards, tmp_path, capsys):
+    """The first evaluation to end deleted the other's fits."""
+    given = [part.format(checkpoint) for part in command] + [str(shards), str(tmp_path / "out")]
     with alone_in(tmp_path / "out"):
-        assert main(["train", str(shards), str(tmp_path / "out"), *TINY]) == 2
+        assert main([*given, *(TINY if command == ["train"] else [])]) == 2
     assert "another process writes into this folder" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -109,6 +109,8 @@ def test_principal_directions_rebuild_the_covariance(loaded):
         ({"jawOpen": (1.0,)}, "did you mean 'jaw.0'"),
         ({"expression.jawOpen": (1.0,)}, "did you mean 'jaw.0'"),
         ({"jaw": (1.0,)}, "got 1 number, expected 3 with commas between, or jaw.0"),
+        ({"jaw.0": (1.0, 2.0)}, "jaw.0: got 2 numbers, expected 1$"),
+        ({"z_id": (1.0, 2.0)}, "z_id: got 2 numbers, expected 1$"),
         ({"neck.3": (1.0,)}, r"none of the neck parameters \(3\); expected 0 to 2$"),
         ({"expression.nope": (1.0,)}, "0 to 3, or a name such as e0, e1, e2 and 1 more$"),
         ({"expression.E3x": (1.0,)}, "did you mean 'e3'"),
