@@ -132,7 +132,7 @@ def run_within(
     state = RunState(
         key=chain.key(), budget=budget.text if budget else "", goal=goal.text if goal else ""
     )
-    path = run_file(chain.dataset)
+    path, former = run_file(chain.dataset), None
     if path.is_file():
         try:
             former = RunState(**read_json_table(path, FormatError, "delete it to choose again"))
@@ -151,8 +151,10 @@ def run_within(
         run.keep()  # the stopped item took time as well
         raise
     except ConfigError:  # measuring does not count again, and an earlier run keeps its choices
-        if path.is_file() and not read_json_table(path, FormatError).get("settings"):
-            path.unlink()
+        if not run.state.settings:
+            path.unlink(missing_ok=True)
+            if former is not None and former.settings:
+                write_json(path, asdict(former))
         raise
 
 

@@ -258,6 +258,18 @@ def test_a_larger_budget_tries_what_a_small_one_had_no_time_for(tmp_path, captur
     assert state.settings["map"] == "reference"
 
 
+def test_a_refusal_after_more_measuring_leaves_an_earlier_run_its_choices(
+    tmp_path, captures, monkeypatch
+):
+    with monkeypatch.context() as patch:
+        patch.setattr("express50.dial.pilot.LIKELY_RATIO", 1e9)
+        go(tmp_path / "d", captures, "5m")
+    before = run_file(Dataset(tmp_path / "d")).read_bytes()
+    with pytest.raises(ConfigError, match=r"0\.1mm: the best .* 0\.5"):
+        go(tmp_path / "d", captures, "4m", "0.1mm")
+    assert run_file(Dataset(tmp_path / "d")).read_bytes() == before
+
+
 def test_a_slower_machine_than_measured_gets_cheaper_settings(tmp_path, captures, monkeypatch):
     count_pauses(monkeypatch)
     tune(chain_of(tmp_path / "d", captures))
