@@ -97,10 +97,10 @@ def _add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: bo
     if preset:
         words = "with --slurm: print the script of a job, and run nothing"
         add("--print-job", action="store_true", help=words)
+        words = "exit with code 1 also if part of an item, such as a camera, was dropped"
+        add("--strict", action="store_true", help=words)
     words = "threads that each worker may use for its item (default: 1)"
     add("--threads", type=number(1), default=1, metavar="N", help=words)
-    words = "exit with code 1 also if part of an item, such as a camera, was dropped"
-    add("--strict", action="store_true", help=words)
 
 
 def add_config_options(parser: argparse.ArgumentParser, preset: bool = True) -> None:
@@ -155,7 +155,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     # Set before a stage imports NumPy, whose BLAS reads the thread limit when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
-    _check_places(dataset, getattr(args, "captures", ()), args.command)
+    _check_places(dataset, args)
     slurm = _slurm_jobs(args)
     if slurm is not None and args.print_job:
         from express50.runner.slurm import job_script
@@ -259,7 +259,7 @@ def _chain(args: argparse.Namespace) -> Iterator[Any]:
         )
     cap_threads(args.threads)
     known, dataset = list(stages().values()), Dataset(args.dataset.resolve())
-    _check_places(dataset, args.captures, args.command)
+    _check_places(dataset, args)
     ladders = {
         stage.name: distinct_settings(stage, args.config, args.set, stages()) for stage in known
     }
@@ -287,11 +287,12 @@ def _exit_code(summaries: Sequence[Any], strict: bool) -> int:
     return OK if all(summary.ok for summary in summaries) and not dropped else FAILED
 
 
-def _check_places(dataset: Dataset, captures: Sequence[Path], command: str) -> None:
+def _check_places(dataset: Dataset, args: argparse.Namespace) -> None:
     """Raise ConfigError if dataset and captures are swapped, or a new dataset lies in either."""
     from express50.capture.readers.read import is_capture
 
-    root, new = dataset.root, not dataset.ledger.exists()
+    captures: Sequence[Path] = getattr(args, "captures", ())
+    command, root, new = args.command, dataset.root, not dataset.ledger.exists()
     if root.is_dir() and new and is_capture(root):
         raise ConfigError(
             f"the first argument is the dataset, and {root} is a capture; expected "
@@ -299,6 +300,8 @@ def _check_places(dataset: Dataset, captures: Sequence[Path], command: str) -> N
         )
     if new:
         check_results_folder(root)
+    if not captures and getattr(args, "replace", False):
+        raise ConfigError("--replace needs the CAPTURE that replaces another; give it")
     for path in captures:
         if Dataset(path).ledger.exists():
             raise ConfigError(

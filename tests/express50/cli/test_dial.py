@@ -19,6 +19,8 @@ from tests.synth import make_capture
         (["--budget", "2"], "expected a time such as 45m"),
         (["--error", "0.5"], "such as 0.5mm"),
         (["--budget", "1h", "--first", "align"], "omit --first and --last"),
+        (["--replace"], "--replace needs the CAPTURE"),
+        (["--budget", "1h", "--replace"], "--replace needs the CAPTURE"),
         (["--budget", "1h", "--preset", "draft"], "--error choose the settings"),
         (["--budget", "1h", "--set", "track.sampels=1"], "did you mean 'samples'"),
     ],
@@ -43,8 +45,9 @@ def test_a_second_budgeted_run_at_once_is_refused(tmp_path, capsys):
 def test_tune_has_no_option_that_needs_chosen_settings(capsys):
     assert main(["tune", "--help"]) == 0
     said = capsys.readouterr().out
-    assert "--set" in said and "--preset" not in said and "--print-job" not in said
-    for option in (["--preset", "draft"], ["--print-job"]):
+    assert "--set" in said
+    for option in (["--preset", "draft"], ["--print-job"], ["--strict"]):
+        assert option[0] not in said
         assert main(["tune", "DATA", *option]) == USAGE
 
 
