@@ -304,8 +304,11 @@ def variants_of(roots: Sequence[Path], names: Sequence[str]) -> dict[str, Varian
     """
     rows = dict(VARIANTS)
     if len(roots) > 1:
-        for root in roots:
-            name = root.parent.parent.name if root.name == "shards" else root.name
+        for number, root in enumerate(roots, 1):
+            place = root.resolve()
+            name = place.parent.parent.name if place.name == "shards" else place.name
+            if f"without_{name}" in rows:  # folders of one name
+                name = f"{name}_{number}"
             rows[f"without_{name}"] = Variant(label=f"W/o {name}", changes={}, without=root)
     check_known("the ablation", "row", names, rows)
     # Rows come after those that they are compared with; no_locality uses the full model's weights.

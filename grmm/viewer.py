@@ -302,12 +302,12 @@ class Viewer:
     def _described(self) -> HeadCodes:
         """Return the head that the controls describe."""
         head = trained_head(self.loaded, self._subject.value, self._expression.value)
-        if self._code.value != SAME:
-            donor = trained_head(self.loaded, self._subject.value, self._code.value)
-            head = replace(head, z_exp=donor.z_exp)
         if self._blend.value:
             goal = trained_head(self.loaded, self._goal.value, self._expression.value)
             head = between(head, goal, float(self._blend.value))
+        if self._code.value != SAME:
+            donor = trained_head(self.loaded, self._subject.value, self._code.value)
+            head = replace(head, z_exp=donor.z_exp)
         changes = {}
         for slider, rest, controls in self._sliders:
             for control in controls if slider.value != rest else ():

@@ -178,6 +178,16 @@ def test_what_cannot_be_measured_is_refused_before_training(roots, tmp_path, mon
     assert "S002: no view is left to measure" in capsys.readouterr().err
 
 
+def test_every_folder_of_shards_has_a_row_whatever_it_is_called(tmp_path, monkeypatch):
+    """Of two folders of one name only the last had one; a relative path gave no name."""
+    monkeypatch.chdir(tmp_path)
+    roots = [Path("pack/shards"), tmp_path / "a/data/pack/shards", tmp_path / "b/data/pack/shards"]
+    rows = ablate_module.variants_of(roots, ())
+    added = {name: row.without for name, row in rows.items() if name not in VARIANTS}
+    names = [f"without_{name}" for name in (tmp_path.name, "data", "data_3")]
+    assert added == dict(zip(names, roots, strict=True))
+
+
 def test_unknown_rows_are_named(roots, tmp_path, capsys):
     assert main([*command(roots, tmp_path), "--rows=no_residual"]) == 2
     assert "did you mean 'no_residuals'" in capsys.readouterr().err

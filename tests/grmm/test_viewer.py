@@ -120,6 +120,15 @@ def test_a_slider_moved_in_a_browser_changes_the_picture(loaded, monkeypatch):
         browser.close()
 
 
+def test_a_residual_code_stays_while_heads_are_blended(loaded):
+    """At the end of the blend it was the expression's own again."""
+    with served(Viewer(loaded, "127.0.0.1", free_port(), moving=48, still=64)) as viewer:
+        viewer._goal.value, viewer._blend.value, viewer._code.value = "S001", 1.0, "e1"
+        got, goal = viewer._described(), trained_head(loaded, "S001", "e0")
+        assert torch.equal(got.z_id, goal.z_id)
+        assert torch.equal(got.z_exp, trained_head(loaded, "S001", "e1").z_exp)
+
+
 def test_a_browser_shows_the_controls(loaded, tmp_path):
     """Every answer over HTTP and the socket was right while the page itself stayed blank."""
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
