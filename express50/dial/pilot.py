@@ -111,9 +111,10 @@ class Pilot:
         dataset = Dataset(root)
         if source is not None:
             shutil.rmtree(root, ignore_errors=True)
-            shutil.copytree(chain.dataset.pilot_dir / source.folder, root, copy_function=_link)
-            record.unlink()
-        elif not root.is_dir():  # otherwise items of a trial that was stopped are kept
+            # A copy that is stopped must not pass for a trial that ran.
+            left_out, place = shutil.ignore_patterns(record.name), chain.dataset.pilot_dir
+            shutil.copytree(place / source.folder, root, ignore=left_out, copy_function=_link)
+        elif not dataset.captures_file.is_file():  # else a stopped trial's items are kept
             self._begin(dataset)
         costs, failed = dict(source.costs) if source else {}, {}
         for stage in chain.stages:
@@ -155,13 +156,12 @@ class Pilot:
     def _begin(self, dataset: Dataset) -> None:
         """Make a dataset of the subject's capture alone, and the labels that people gave."""
         given = self.chain.dataset
-        dataset.root.mkdir(parents=True)
-        capture = str(given.captures()[self.subject].resolve())
-        write_json(dataset.captures_file, {self.subject: capture})
         labels, target = (one.labels_file(self.subject) for one in (given, dataset))
         if labels.is_file():  # the reference may be somebody whom the trial lacks
-            target.parent.mkdir()
+            target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(labels, target)
+        capture = str(given.captures()[self.subject].resolve())
+        write_json(dataset.captures_file, {self.subject: capture})  # last, as it marks the begin
 
     def _run(
         self, stage: Stage, dataset: Dataset, config: Any, anew: bool

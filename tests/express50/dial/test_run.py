@@ -237,6 +237,28 @@ def test_an_interrupted_run_goes_on_with_its_choices_and_ends_alike(
     assert outputs(tmp_path / "d") == outputs(tmp_path / "other")
 
 
+@pytest.mark.parametrize("step", ["write_json", "shutil.copytree"])
+def test_a_trial_that_is_killed_while_it_is_set_up_runs_anew(tmp_path, captures, monkeypatch, step):
+    """A folder without its capture passed for begun, and a copy for the trial that it copied."""
+    copy = shutil.copytree
+
+    def killed(*given, **more):
+        monkeypatch.setattr("shutil.copytree", copy)  # which calls itself
+        if step == "shutil.copytree":
+            copy(*given, **more)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(f"express50.dial.pilot.{step}", killed)
+        go(tmp_path / "d", captures, "5m")
+    said = []
+    go(tmp_path / "d", captures, "5m", said=said)
+    assert not [line for line in said if "cannot be measured" in line]
+    measured = json.loads((dial_dir(Dataset(tmp_path / "d")) / "measured.json").read_text())
+    tried = {(t["settings"]["solve"], t["settings"]["map"]) for t in measured["trials"]}
+    assert len(tried) == len(measured["trials"]) == 5
+
+
 def test_captures_that_come_after_a_finished_run_get_the_budget_anew(
     tmp_path, captures, monkeypatch
 ):
