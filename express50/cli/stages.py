@@ -353,11 +353,14 @@ def _items(
             raise ConfigError(f"{dataset.root}: has no captures yet; run {call}")
     if pattern is None:
         return None
-    # A stage that runs first in another's command may have other items; take the same subjects'.
+    # A stage that runs first in another's command may have other items; take the same subjects',
+    # or all if an item is not a subject's.
     asked = select_items(stages()[args.stage], dataset, pattern)
     if stage.name == args.stage:
         return asked
     subjects = {item.split("/")[0] for item in asked}
+    if not subjects <= {*dataset.subjects()}:
+        return None
     return [item for item in stage.items(dataset) if item.split("/")[0] in subjects]
 
 

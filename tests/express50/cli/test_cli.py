@@ -244,6 +244,13 @@ def test_a_chain_that_cannot_go_on_ends_with_the_cause(run, data, tmp_path):
     assert "calibrate has nothing to do, because ingest failed" in err.splitlines()[-1]
 
 
+def test_the_one_item_of_pack_needs_every_subject_encoded(run, data, capture):
+    """`encode` has no item of that name, so it was said to have nothing to do."""
+    run("ingest", data, capture)
+    code, out, _ = run("pack", data, "--items", "shards", "--workers", "0")
+    assert code == 1 and "encode: 1 item = 0 done + 0 skipped + 1 failed" in out
+
+
 def test_a_stage_of_a_folder_that_is_no_dataset_says_so(run, tmp_path):
     for pattern in ([], ["--items", "S001/*"]):
         assert "not a dataset" in run("matte", tmp_path, *pattern)[2]
