@@ -55,7 +55,8 @@ def parse_budget(text: str) -> Budget:
 
 
 def budget_text(seconds: float, cores: bool) -> str:
-    """Write seconds as a budget, rounded up."""
+    """Write seconds as a budget, rounded up; at least a second, as no budget is 0."""
+    seconds = max(seconds, 1.0)
     if cores:
         return f"{math.ceil(seconds / 36) / 100:g}ch"
     if seconds < 120:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from express50.dial.budget import Clock, parse_budget, parse_goal
+from express50.dial.budget import Clock, budget_text, parse_budget, parse_goal
 from express50.errors import ConfigError
 from express50.runner.executor import Pool
 from express50.runner.ledger import Receipt
@@ -24,6 +24,14 @@ def test_budgets_are_read(text, seconds, cores):
 def test_text_that_is_not_a_time_is_refused(text):
     with pytest.raises(ConfigError, match="expected a time such as 45m"):
         parse_budget(text)
+
+
+@pytest.mark.parametrize("cores", [False, True])
+@pytest.mark.parametrize("seconds", [0.0, 0.2, 61.3, 121.0, 7000.0, 40000.0])
+def test_an_advised_budget_can_be_given_and_is_enough(seconds, cores):
+    """What was left of a run that made more items than foreseen was 0s."""
+    budget = parse_budget(budget_text(seconds, cores))
+    assert budget.cores == cores and seconds <= budget.seconds
 
 
 def test_goals_are_read():
