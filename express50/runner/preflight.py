@@ -133,5 +133,5 @@ def _space_problems(dataset: Dataset, needs: Sequence[tuple[str, int, float]]) -
         yield (
             f"{dataset.root}: about {decimal(int(need))} of disk are needed, most by {largest[0]} "
             f"({count(largest[1], 'item')} of {decimal(int(largest[2]))}), and "
-            f"{decimal(int(room))} are free; free some space, or make fewer items with --items"
+            f"{decimal(int(room))} are free; free some space, or run single stages with --items"
         )

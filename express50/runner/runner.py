@@ -116,7 +116,8 @@ class Summary:
         for (restored, why), count in again.most_common():
             yield f"  {'restored' if restored else 'made again'} {count}: {why or 'same as before'}"
         if imported := sum(o.reason == KEPT for o in self.outcomes):
-            yield f"  kept {imported} imported (to drop them: 'express50 import remove')"
+            drop = f"'express50 import remove DATASET {self.stage}'"
+            yield f"  kept {imported} imported (to drop them: {drop})"
         for outcome in self.outcomes:
             if outcome.status == "failed":
                 yield f"  failed {outcome.item}: {outcome.reason}"

@@ -371,7 +371,7 @@ def test_a_subject_without_masks_does_not_stop_the_others(tmp_path, capsys) -> N
     assert "= 2 done + 1 failed" in said
     assert "failed S001: StageError: S001: 12 of 12 files are missing" in said
     done = run_here(MATTE, dataset, ["S002/smile"])
-    assert any("kept 1 imported" in line for line in done.lines())
+    assert any("kept 1 imported" in line and "DATASET matte'" in line for line in done.lines())
 
 
 def test_tracks_and_depth_of_the_recorded_size_fit_reduced_pictures(
