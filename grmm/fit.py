@@ -167,8 +167,8 @@ def _kept(state: FitState, path: Path, made_from: dict[str, object]) -> Iterator
         yield keep
 
 
-def invert_codes(state: FitState, limit: float = math.inf, keep: Keep | None = None) -> int:
-    """Optimise z_id and z_exp (stage 1) for at most this many seconds; returns all iterations."""
+def invert_codes(state: FitState, limit: float = math.inf, keep: Keep | None = None) -> None:
+    """Optimise z_id and z_exp (stage 1) for at most this many seconds."""
     settings = state.config.fit
     state.model.requires_grad_(False)
     codes = [state.z_id, *state.z_exp.values()]
@@ -184,11 +184,10 @@ def invert_codes(state: FitState, limit: float = math.inf, keep: Keep | None = N
         optimizer.step()
     for code in codes:
         code.requires_grad_(False)
-    return state.done.iterations[1]
 
 
-def tune_decoders(state: FitState, limit: float = math.inf, keep: Keep | None = None) -> int:
-    """Fine-tune the decoders with the locality loss (stage 2); returns all iterations."""
+def tune_decoders(state: FitState, limit: float = math.inf, keep: Keep | None = None) -> None:
+    """Fine-tune the decoders with the locality loss (stage 2)."""
     settings, train = state.config.fit, state.config.train
     # Adam moves the decoders; codes and refinement stay fixed.
     rates = {"decoders": settings.stage2_lr, "texels": settings.stage2_lr * train.texel_lr_scale}
@@ -211,7 +210,6 @@ def tune_decoders(state: FitState, limit: float = math.inf, keep: Keep | None = 
         _finite(loss, number, 2).backward()
         optimizer.step()
     state.model.requires_grad_(False)
-    return state.done.iterations[2]
 
 
 def _items(
