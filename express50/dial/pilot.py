@@ -204,7 +204,7 @@ def cost_of(dataset: Dataset, stage: str, receipts: Sequence[Receipt], extra: fl
     )
 
 
-def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
+def keep_for_run(dataset: Dataset, settings: Mapping[str, str], trials: Sequence[Trial]) -> None:
     """Put copies of what trials made at chosen settings into the store of replaced outputs.
 
     The run takes an output from there where it would make the same. Trials that share the settings
@@ -216,12 +216,10 @@ def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
         differ = (k for k, name in enumerate(settings) if trial.settings[name] != settings[name])
         return next(differ, len(settings))
 
-    trials = [
-        (trial_of(json.loads(record.read_text("utf-8"))), Dataset(record.parent))
-        for record in sorted(dataset.pilot_dir.glob("*/trial.json"))
-    ]
-    for trial, folder in sorted(trials, key=lambda pair: -alike(pair[0])):
-        for name in (n for n, label in settings.items() if trial.settings.get(n) == label):
+    there = [t for t in trials if t.folder and (dataset.pilot_dir / t.folder).is_dir()]
+    for trial in sorted(there, key=lambda trial: -alike(trial)):
+        folder = Dataset(dataset.pilot_dir / trial.folder)
+        for name in (n for n, label in settings.items() if trial.settings[n] == label):
             with Ledger(folder.ledger, read_only=True) as ledger:
                 receipts, made = ledger.read(name), ledger.made(name)
             for item in (i for i in made if (name, i) not in kept):

@@ -172,7 +172,7 @@ def _measure_and_run(
         run.state = replace(
             state, settings=point.settings, seconds=clock.now() + point.seconds, promised=promised
         )
-        keep_for_run(chain.dataset, point.settings)
+        keep_for_run(chain.dataset, point.settings, run.measured.trials)
         lines = choice_lines(load, point, run.asked(), clock.now())
     else:
         if again:

@@ -130,10 +130,13 @@ def test_what_trials_made_costs_the_run_nothing(tmp_path, expressions):
 
 @pytest.mark.parametrize("steps", [("standard", "draft"), ("reference", "draft")])
 def test_a_run_takes_what_the_trial_with_its_settings_made(tmp_path, steps):
-    chain = chain_of(tmp_path / "d", captures_of(tmp_path / "c", 1, 3))
-    measured_figures(chain, Clock(None))
+    """Even if trials of former settings of the same names are there."""
+    captures = captures_of(tmp_path / "c", 1, 3)
+    former, chain = (chain_of(tmp_path / "d", captures) for _ in range(2))
+    former.ladders["solve"] = {k: StepsConfig(steps=n + 1) for k, n in STEPS.items()}
+    _, measured = (measured_figures(one, Clock(None)) for one in (former, chain))
     chosen = dict(zip(("ingest", "align", "solve", "map"), ("standard",) * 2 + steps, strict=True))
-    keep_for_run(chain.dataset, chosen)
+    keep_for_run(chain.dataset, chosen, measured.trials)
     restored = {}
     for stage in chain.stages:
         config = chain.ladders[stage.name][chosen[stage.name]]
