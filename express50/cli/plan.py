@@ -30,7 +30,7 @@ from express50.console import (
 from express50.contract.config import PRESETS, made_with, resolve_config
 from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import Stage, stages
-from express50.dial.figures import Footage, dial_dir, footage_of, read_measured
+from express50.dial.figures import Cost, Footage, dial_dir, footage_of, read_measured
 from express50.errors import rounded
 from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger
@@ -199,13 +199,16 @@ def measure_sizes(
         seen = trials[0]
         # A run without a budget has standard settings, which do not reduce pictures.
         found = [(replace(seen.footage, expressions=seen.scripted, side=0.0), {})]
-    for trial in trials:
+    counted: set[tuple[str, Cost]] = set()
+    for trial in trials:  # each states, too, what the stages cost that it took from another
+        new = {name: cost for name, cost in trial.costs.items() if (name, cost) not in counted}
+        counted |= new.items()
         table = {
             name: Measured(
-                seconds=(cost.core_seconds,) * cost.items, bytes=cost.bytes, memory=cost.memory,
+                seconds=(cost.core_seconds,), bytes=cost.bytes, memory=cost.memory,
                 preset=trial.settings[name],
             )
-            for name, cost in trial.costs.items()
+            for name, cost in new.items()
         }  # fmt: skip
         found.append((trial.footage, table))
     return found
