@@ -197,7 +197,7 @@ def _is_ready(
     """Say what would stop stages with these configurations; return whether nothing would."""
     from express50.runner.preflight import problems
 
-    found = list(problems(dataset, work, pool, all_items))
+    found = dict.fromkeys(problems(dataset, work, pool, all_items))  # settings share some
     for line in found:
         log(f"express50: {line}")
     return not found

@@ -32,7 +32,7 @@ def problems(
     Memory and disk space are judged by the receipts of items that were made in this dataset; the
     space for some of the items is left to `expected_shortage`.
     """
-    chosen = [stage for stage, _ in work]
+    chosen = list({stage.name: stage for stage, _ in work}.values())  # of several settings, once
     yield from _folder_problems(dataset, chosen)
     for stage, config in work:
         yield from _refusal(stage.try_files, config)

@@ -22,6 +22,7 @@ from tests.synth import make_capture
         (["--replace"], "--replace needs the CAPTURE"),
         (["--budget", "1h", "--replace"], "--replace needs the CAPTURE"),
         (["--budget", "1h", "--preset", "draft"], "--error choose the settings"),
+        (["--budget", "1h", "--set", "track.landmarks=/nope"], "track.landmarks is /nope"),
         (["--budget", "1h", "--set", "track.sampels=1"], "did you mean 'samples'"),
     ],
 )

@@ -100,6 +100,7 @@ def test_space_is_compared_with_what_items_took(dataset, monkeypatch):
     usage = SimpleNamespace(total=1e12, free=100e6 + 400e3)
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
     assert found(dataset) == []
+    assert found(dataset, 2 * WORK) == [], "a budget tries several settings and runs one"
     usage.free = 100e6 + 300e3
     (line,) = found(dataset)
     assert "about 384.1 kB of disk are needed, most by toy (2 items of 192.1 kB), and 300.0" in line
