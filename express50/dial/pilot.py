@@ -114,8 +114,7 @@ class Pilot:
             # A copy that is stopped must not pass for a trial that ran.
             left_out, place = shutil.ignore_patterns(record.name), chain.dataset.pilot_dir
             shutil.copytree(place / source.folder, root, ignore=left_out, copy_function=_link)
-        elif not dataset.captures_file.is_file():  # else a stopped trial's items are kept
-            self._begin(dataset)
+        self._begin(dataset)  # what a trial that was stopped has made is kept
         costs, failed = dict(source.costs) if source else {}, {}
         for stage in chain.stages:
             config = chain.ladders[stage.name][settings[stage.name]]
@@ -156,12 +155,13 @@ class Pilot:
     def _begin(self, dataset: Dataset) -> None:
         """Make a dataset of the subject's capture alone, and the labels that people gave."""
         given = self.chain.dataset
-        labels, target = (one.labels_file(self.subject) for one in (given, dataset))
-        if labels.is_file():  # the reference may be somebody whom the trial lacks
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(labels, target)
         capture = str(given.captures()[self.subject].resolve())
-        write_json(dataset.captures_file, {self.subject: capture})  # last, as it marks the begin
+        write_json(dataset.captures_file, {self.subject: capture})
+        labels, target = (one.labels_file(self.subject) for one in (given, dataset))
+        # The reference may be somebody whom the trial lacks.
+        if labels.is_file() and not target.is_file():
+            target.parent.mkdir(exist_ok=True)
+            shutil.copy2(labels, target)
 
     def _run(
         self, stage: Stage, dataset: Dataset, config: Any, anew: bool

@@ -240,13 +240,13 @@ def test_an_interrupted_run_goes_on_with_its_choices_and_ends_alike(
     assert outputs(tmp_path / "d") == outputs(tmp_path / "other")
 
 
-@pytest.mark.parametrize("step", ["write_json", "shutil.copytree"])
-def test_a_trial_that_is_killed_while_it_is_set_up_runs_anew(tmp_path, captures, monkeypatch, step):
+@pytest.mark.parametrize("step", ["write_json", "shutil.copytree", "run_stage"])
+def test_a_trial_that_was_killed_goes_on_with_a_capture_that_was_moved(tmp_path, monkeypatch, step):
     """A folder without its capture passed for begun, and a copy for the trial that it copied."""
-    copy = shutil.copytree
+    captures, copy = captures_of(tmp_path / "c", 1, 4), shutil.copytree
 
     def killed(*given, **more):
-        monkeypatch.setattr("shutil.copytree", copy)  # which calls itself
+        patch.setattr("shutil.copytree", copy)  # which calls itself
         if step == "shutil.copytree":
             copy(*given, **more)
         raise KeyboardInterrupt
@@ -254,12 +254,12 @@ def test_a_trial_that_is_killed_while_it_is_set_up_runs_anew(tmp_path, captures,
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(f"express50.dial.pilot.{step}", killed)
         go(tmp_path / "d", captures, "5m")
-    said = []
-    go(tmp_path / "d", captures, "5m", said=said)
-    assert not [line for line in said if "cannot be measured" in line]
+    (tmp_path / "c").rename(tmp_path / "moved")
+    go(tmp_path / "d", [tmp_path / "moved" / "S0"], "5m")
     measured = json.loads((dial_dir(Dataset(tmp_path / "d")) / "measured.json").read_text())
     tried = {(t["settings"]["solve"], t["settings"]["map"]) for t in measured["trials"]}
     assert len(tried) == len(measured["trials"]) == 5
+    assert not any(trial["failed"] for trial in measured["trials"])
 
 
 def test_captures_that_come_after_a_finished_run_get_the_budget_anew(
