@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -129,7 +130,8 @@ class Pilot:
             if cost is not None:
                 costs[stage.name] = cost
             if why:
-                failed[stage.name] = why.replace(self.subject, "the subject")
+                own = rf"(?<![\w.]){re.escape(self.subject)}(?!\w)"  # not in words and numbers
+                failed[stage.name] = re.sub(own, "the subject", why)
             _cut_peaks(dataset, self.subject, peaks)
             broken = stage.name in failed and stage.name in chain.measurable()
             if self.cut or broken:  # what follows would be of older outputs, or of none

@@ -31,6 +31,7 @@ from tests.express50.dial.toy_chain import (
     error_of,
 )
 from tests.faults.toy import tree
+from tests.synth import make_capture
 
 STEPS = {"draft": 1, "standard": 4, "reference": 16}
 
@@ -413,6 +414,14 @@ def test_a_stage_that_fails_at_every_setting_is_named_and_nothing_else_is_tried(
         go(tmp_path / "d", captures, "5m", said=said)
     assert sum("cannot be measured" in line for line in said) == 2  # the last one is the error
     assert not any(line.startswith("measuring map") for line in said)
+
+
+def test_a_reason_names_no_subject_and_keeps_the_words_that_hold_its_id(tmp_path, monkeypatch):
+    """Of a person called `s`, it said `16 the subjecttepthe subject`."""
+    make_capture(tmp_path / "s", subject="s", cameras=2, frames=4, size=48, expressions=("e0",))
+    monkeypatch.setenv(FAILS, "solve")
+    with pytest.raises(StageError, match="solve: .*the subject: 16 steps lead nowhere"):
+        go(tmp_path / "d", [tmp_path / "s"], "5m")
 
 
 def test_a_subject_that_cannot_be_ingested_is_not_measured_but_the_next_is(tmp_path):
