@@ -229,6 +229,8 @@ def main() -> None:
     parser.add_argument("--train-seconds", type=int, default=TRAIN_SECONDS)
     parser.add_argument("--fit-seconds", type=int, default=FIT_SECONDS)
     args = parser.parse_args()
+    if args.captures and len(args.captures) < 2:
+        parser.error("--captures: expected two or more, as training leaves out the last person")
     name = "demo" if args.captures is None else "+".join(c.name for c in args.captures)
     dataset, truth, steps = args.out / "data" / name, None, []
     captures = args.captures

@@ -37,7 +37,7 @@ def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Resu
 
 STAGE = Stage(
     name="calibrate",
-    version=17,
+    version=18,
     config=CalibrateConfig,
     presets=PRESETS,
     items=Dataset.subjects,  # a rig may be bumped between two: each has its own cameras

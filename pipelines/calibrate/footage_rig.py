@@ -58,6 +58,7 @@ the image's corner, as a share of half of it: footage alone says little about ei
 LOOSE = 0.02  # share of the diagonal: a camera that may be off by more at the head is not placed
 OUTLIER = 4.0  # sigmas; features with larger errors are mismatches and not reported
 EYES = (slice(36, 42), slice(42, 48))
+FRONTAL = 0.75  # cosine between the face's direction and that to a camera that must see the face
 NOMINAL = 2.5  # focal length, in longer sides, at which distances are first estimated
 INNER = slice(17, 68)  # the jaw's outline is not the same skin from every side
 BY_CHANCE = 0.025  # share of wrong points that fit a wrong pose, at most
@@ -245,14 +246,25 @@ def _adjust(
 def _showing_head(
     found: Mapping[str, Camera], rig: Mapping[str, Camera], seen: Mapping[int, FrameSetPoints]
 ) -> dict[str, Camera]:
-    """Return the cameras whose pictures show the middle of the head that a rig sees."""
-    middle = np.median(_landmark_points(rig, seen), axis=(0, 1))
-    pixels = {name: project(pinhole(camera), middle[None])[0][0] for name, camera in found.items()}
-    return {
-        name: camera
-        for name, camera in found.items()
-        if ((pixels[name] > 0) & (pixels[name] < (camera.width, camera.height))).all()
-    }
+    """Return the cameras whose pictures show the middle of the head that a rig sees.
+
+    A camera without a face does not stand in front of it: such a pose comes from features that only
+    look alike, as on the two walls of a corridor.
+    """
+    shapes = _landmark_points(rig, seen)
+    middle = np.median(shapes, axis=(0, 1))
+    head = mean_landmarks()
+    forward = np.mean([rigid_fit(head, shape)[0][:, 2] for shape in shapes], axis=0)
+    faces = {name for points in seen.values() for name, _, _ in points.landmarks}
+    showing = {}
+    for name, camera in found.items():
+        pixels, _ = project(pinhole(camera), middle[None])
+        inside = ((pixels > 0) & (pixels < (camera.width, camera.height))).all()
+        towards = camera.center - middle
+        frontal = forward @ towards > FRONTAL * np.linalg.norm(forward) * np.linalg.norm(towards)
+        if inside and (name in faces or not frontal):
+            showing[name] = camera
+    return showing
 
 
 def _expected(

@@ -19,7 +19,7 @@ PHOTO_SETTINGS = (
     "observe.min_score=0.2", f"track.search={SEARCH}", f"observe.search={SEARCH}",
     "matte.method=grabcut",
 )  # fmt: skip
-WALK = 40  # pictures, of all around a head one every 8 degrees
+WALK = 24  # pictures, one every 8 degrees from ear to ear
 WORDS = "track the face in a single photograph or video, without calibration"
 
 

@@ -217,6 +217,12 @@ def test_time_budget_ends_the_run(tmp_path, source):
     assert metrics["seconds"] < 20
 
 
+def test_a_budget_that_outlasts_the_steps_is_said_to_be_left(tmp_path, source, capsys):
+    train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 1, "seconds": 3600}))
+    said = capsys.readouterr().err
+    assert "of the budget are left, because train.iterations is 1" in said
+
+
 def test_slow_steps_show_their_progress(tmp_path, source, monkeypatch, capsys):
     monkeypatch.setattr(train_module, "SAY_SECONDS", 0.0)
     train(source, ellipsoid_head(), tmp_path, tiny_config())

@@ -123,7 +123,7 @@ def test_the_world_is_upright_and_cameras_on_their_side_follow_the_head(solved):
 
 
 def test_a_camera_without_a_face_is_placed_by_features_or_dropped_with_the_reason():
-    rig = face_cameras(7, 100.0)
+    rig = face_cameras(7, 150.0)
     seen = see(rig, blind=("cam05", "cam06"))
     for points in seen.values():
         points.features["cam06"] = (np.zeros((0, 2)), np.zeros((0, 128), np.float32))
@@ -242,6 +242,12 @@ def test_a_camera_that_looks_away_from_the_head_is_not_placed():
     away = replace(rig["cam02"], cam_from_world=turned @ rig["cam02"].cam_from_world)
     assert set(_showing_head(rig, rig, see(rig))) == set(rig)
     assert set(_showing_head({**rig, "cam02": away}, rig, see(rig))) == set(rig) - {"cam02"}
+
+
+def test_a_camera_without_a_face_is_not_placed_in_front_of_it():
+    rig = face_cameras(7, 150.0)
+    blind = see(rig, blind=("cam02", "cam06"))
+    assert set(_showing_head(rig, rig, blind)) == set(rig) - {"cam02"}
 
 
 @pytest.mark.parametrize(("turn_rad", "mirrored", "named"), [
