@@ -57,6 +57,7 @@ CENTRE, BEND = 0.005, 0.02
 the image's corner, as a share of half of it: footage alone says little about either."""
 LOOSE = 0.02  # share of the diagonal: a camera that may be off by more at the head is not placed
 OUTLIER = 4.0  # sigmas; features with larger errors are mismatches and not reported
+PERSON_M, LEAST_OWN = 0.35, 4  # distance from the head's middle; fewest features within it
 EYES = (slice(36, 42), slice(42, 48))
 FRONTAL = 0.75  # cosine between the face's direction and that to a camera that must see the face
 NOMINAL = 2.5  # focal length, in longer sides, at which distances are first estimated
@@ -72,6 +73,11 @@ FacePoses: TypeAlias = dict[str, dict[int, tuple[np.ndarray, float]]]
 LONE = (
     "it sees a face, but never at the same time as the other cameras do: add a camera between it"
     " and the next, board images or calibration.json"
+)
+BY_ROOM = (
+    "it sees no face, and what it shares with other cameras lies in the room, not on the person; if"
+    " the person moved between pictures, or parts of the room look alike, it is off by far more"
+    " than stated, so look at its matte"
 )
 BLIND = (
     "it sees no face well, and too few of its features match other cameras: add a camera between"
@@ -97,7 +103,7 @@ class FootageSolution:
     errors: np.ndarray  # (N, 2) pixels, of the tracks
     inliers: np.ndarray  # (N,) marks the features that are not mismatches
     dropped: dict[str, str]  # a reason per camera
-    weak: dict[str, str]  # a reason per camera held by the face alone
+    weak: dict[str, str]  # a reason per camera held by the face alone, or by the room alone
     uncertainty: dict[str, HeadError]
     eyes: EyeScale
 
@@ -168,14 +174,18 @@ def solve_footage(
     up = np.mean([rigid_fit(head, p)[0] for p in shapes], axis=0)[:, 1]
     sigmas = np.linalg.norm(adjusted.errors, axis=1) / tracks.sigma
     away = {n: float(np.linalg.norm(camera.center - middle)) for n, camera in metric.items()}
+    inliers = tracks.features() & (sigmas < OUTLIER)
+    near = np.linalg.norm(eyes.metres * adjusted.points - middle, axis=1) < PERSON_M
+    own = np.bincount(tracks.camera[inliers & near[tracks.point]], minlength=len(tracks.names))
+    by_room = {n for n, count in zip(tracks.names, own, strict=True) if count < LEAST_OWN} - faces
     return FootageSolution(
         cameras=move_cameras(metric, canonical_from_rig(metric, middle, up)),
         tracks=tracks,
         errors=adjusted.errors,
-        inliers=tracks.features() & (sigmas < OUTLIER),
+        inliers=inliers,
         dropped=mirrored
         | {n: LONE if n in faces else BLIND for n in sorted(sizes) if n not in metric},
-        weak=_weak(tracks),
+        weak=dict.fromkeys(sorted(by_room), BY_ROOM) | _weak(tracks),
         uncertainty={n: head_error_of(metric[n], px**2, away[n]) for n, px in expected.items()},
         eyes=eyes,
     )

@@ -15,6 +15,7 @@ from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, ConfigError
 from express50.files.calibration import camera_rows
 from express50.files.images import write_image
+from express50.geometry.cameras import project
 from express50.geometry.conventions import MIRROR_X
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform, similarity_fit
 from express50.rigs.camera_builder import in_metres
@@ -248,6 +249,26 @@ def test_a_camera_without_a_face_is_not_placed_in_front_of_it():
     rig = face_cameras(7, 150.0)
     blind = see(rig, blind=("cam02", "cam06"))
     assert set(_showing_head(rig, rig, blind)) == set(rig) - {"cam02"}
+
+
+def test_a_camera_that_shares_only_the_room_with_others_is_named():
+    rig, last = face_cameras(12, 99.0), "cam11"
+    seen, rng = see(rig, sets=1, blind=(last,)), np.random.default_rng(5)
+    room = rng.normal(size=(6000, 3)) * [1.0, 0.3, 1.0]
+    room *= rng.uniform(2.0, 4.0, (6000, 1)) / np.linalg.norm(room, axis=1, keepdims=True)
+    looks = rng.normal(size=(6000, 128)).astype(np.float32)
+    looks /= np.linalg.norm(looks, axis=1, keepdims=True)
+    for points in seen.values():
+        for name, camera in rig.items():
+            pixels, _ = project(camera, room)
+            shown = ((pixels > 0) & (pixels < SIZE)).all(1)
+            own = [np.zeros((0, 2)), np.zeros((0, 128), np.float32)]
+            own = own if name == last else points.features[name]
+            rows = pixels[shown] + rng.normal(size=(shown.sum(), 2)) * 0.3, looks[shown]
+            points.features[name] = tuple(map(np.concatenate, zip(own, rows, strict=True)))
+    solved = solve(rig, seen)
+    assert last in solved.cameras
+    assert list(solved.weak) == [last] and "lies in the room" in solved.weak[last]
 
 
 @pytest.mark.parametrize(("turn_rad", "mirrored", "named"), [
