@@ -174,6 +174,7 @@ def train(
             f"{left} of the budget are left, because train.iterations is {state.iteration}; the"
             " same command with a larger --set train.iterations=N trains on"
         )
+
     # --- The report ----------------------------------------------------------------------------
     return report(state, config, out, perceptual) if rank == 0 else {}
 

@@ -214,6 +214,9 @@ def gather_shards(sources: Sequence[tuple[Path, str]], out: Path) -> dict[str, s
         for shard in read_json(root / "index.json", FormatError)["shards"]:
             name = shard_name(split, sum(row["split"] == split for row in shards))
             shards.append(shard | {"file": name, "split": split})
+            if shard["file"] not in known:
+                lacks = f"lacks {shard['file']}, which index.json names; {AGAIN}"
+                raise FormatError(f"{root / 'manifest.json'}: {lacks}")
             digests[name] = known[shard["file"]]
             link_file(root / shard["file"], out / name)
         for name, digest in known.items():

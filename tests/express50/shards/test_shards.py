@@ -20,6 +20,7 @@ from express50.shards.reader import ShardReader
 from express50.shards.writer import (
     PackedSample,
     ShardWriter,
+    gather_shards,
     sample_key,
     tar_header,
     verify,
@@ -246,6 +247,16 @@ def test_a_forged_index_is_refused(shards, tmp_path, change, message):
     (root / "index.json").write_text(json.dumps(table))
     with pytest.raises(FormatError, match=message):
         ShardReader(root)
+
+
+def test_a_manifest_that_lacks_a_shard_is_named_when_shards_are_gathered(shards, tmp_path):
+    root = shutil.copytree(shards, tmp_path / "bad")
+    table = json.loads((root / "manifest.json").read_text())
+    table["files"] = {n: row for n, row in table["files"].items() if not n.endswith(".tar")}
+    (root / "manifest.json").write_text(json.dumps(table))
+    (tmp_path / "out").mkdir()
+    with pytest.raises(FormatError, match=r"manifest.json: lacks .*\.tar, which index.json names"):
+        gather_shards([(root, "train")], tmp_path / "out")
 
 
 def test_manifest_cannot_point_outside(shards, tmp_path):
