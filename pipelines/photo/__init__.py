@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -86,10 +87,10 @@ def run_photo(args: argparse.Namespace) -> int:
             f"{args.out}: subject {subject} already has the capture {known}; give the picture"
             " another id with --subject, or name another OUT"
         )
+    if profile := picture.hdr or (picture.profile and picture.profile.name):
+        log(f"{picture.path}: its colours are converted from {profile!r} to sRGB")
     if args.walk:
         return walk(args, folder, subject)
-    if picture.profile is not None:
-        log(f"{picture.path}: its colours are converted from {picture.profile.name!r} to sRGB")
     clips, given = ("track.frames=clips",) if picture.video else (), args.set
     args.set = [*PHOTO_SETTINGS, *clips, *given]
     names = [name for name in STAGES if args.matte or name != "matte"]
@@ -148,7 +149,7 @@ def walk(args: argparse.Namespace, folder: Path, subject: str) -> int:
             "--walk only writes pictures; give --set, --config and --preset to 'express50 run',"
             " which makes mattes too"
         )
-    for odd in odd_tags(video_tags(video.path)):
+    for odd in odd_tags(replace(video_tags(video.path), hdr="")):  # that is converted
         log(f"warning: {video.path}: {odd}")
     frames = write_walk_capture(video, folder, subject, args.walk, args.focal_px)
     if args.json:

@@ -14,7 +14,7 @@ import shutil
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from pathlib import Path
 
@@ -50,6 +50,7 @@ from express50.files.video import (
 )
 from express50.geometry.cameras import Camera, pinhole_camera
 from express50.geometry.conventions import FLIP_YZ
+from express50.geometry.pixels import hdr_to_srgb
 from express50.geometry.sampling import edge_width, evenly
 from express50.head.load import load_head
 from express50.head.model import landmarks_of
@@ -99,6 +100,7 @@ class PhotoSource:
     orientation: int = 1  # EXIF's, 1 is upright
     film_mm: float = 0.0  # focal length on 35 mm film of the same diagonal angle; 0 if unknown
     profile: ColourProfile | None = None  # of its colours; None: sRGB
+    hdr: str = ""  # a video's curve, if that is one for high dynamic range
 
 
 def open_picture(path: Path) -> PhotoSource:
@@ -113,8 +115,8 @@ def open_picture(path: Path) -> PhotoSource:
         raise CaptureError(f"{path}: {no_file(path)}; expected a photograph or a video")
     suffix = path.suffix.lower()
     if suffix in VIDEO_SUFFIXES:
-        orientation = ORIENTATION[video_tags(path).turn]
-        return PhotoSource(path, video=True, orientation=orientation)
+        tags = video_tags(path)
+        return PhotoSource(path, video=True, orientation=ORIENTATION[tags.turn], hdr=tags.hdr)
     if suffix not in PHOTO_SUFFIXES:
         raise CaptureError(
             f"{path}: not a photograph or video; expected a file name that ends in "
@@ -136,7 +138,8 @@ def upright_frames(picture: PhotoSource) -> Iterator[np.ndarray]:
         yield image if picture.profile is None else picture.profile.to_srgb(image)
         return
     for _, image in iterate_video(picture.path):
-        yield upright(image, picture.orientation)
+        image = upright(image, picture.orientation)
+        yield hdr_to_srgb(image, picture.hdr) if picture.hdr else image
 
 
 @dataclass(frozen=True)
@@ -262,13 +265,15 @@ def write_walk_capture(
     write_bytes(folder / "capture.toml", "\n".join([*lines, ""]).encode())
     for earlier in folder.glob("*.jpg"):
         earlier.unlink()
-    chosen, images = [], upright_frames(video)
+    # Only those that are kept are converted from HDR, which takes a second per 4K frame.
+    chosen, images = list[int](), upright_frames(replace(video, hdr=""))
     edges = np.linspace(0, frames, count + 1).round().astype(int).tolist()
     for first, end in pairwise(edges):
         part = zip(range(first, end), images, strict=False)
         found = min(part, key=lambda one: edge_width(one[1]) or math.inf, default=None)
         if found is not None:  # a video may hold fewer frames than it says
-            write_image(folder / f"{found[0]:05d}.jpg", found[1])
+            image = hdr_to_srgb(found[1], video.hdr) if video.hdr else found[1]
+            write_image(folder / f"{found[0]:05d}.jpg", image)
             chosen.append(found[0])
     return chosen
 
@@ -342,7 +347,7 @@ def _write_footage(picture: PhotoSource, folder: Path) -> None:
     name = f"video{suffix}" if picture.video else f"frames/000000{suffix}"
     target = folder / name
     target.parent.mkdir(parents=True)
-    as_needed = picture.orientation == 1 and picture.profile is None
+    as_needed = picture.orientation == 1 and picture.profile is None and not picture.hdr
     if as_needed and (picture.video or suffix in IMAGE_SUFFIXES):
         try:
             shutil.copyfile(picture.path, target)

@@ -21,6 +21,7 @@ from express50.files.calibration import read_cameras
 from express50.files.containers import read_picture
 from express50.files.images import write_image
 from express50.files.video import iterate_video
+from express50.geometry.pixels import hdr_to_srgb
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
 from pipelines.calibrate.footage import has_one_lens
@@ -149,6 +150,17 @@ def test_a_walk_around_a_person_gives_its_sharpest_pictures_as_one_rig(tmp_path,
     assert has_one_lens(index) and index.meta["focal_px"] == 500
     assert main(walk) == 1 and "was made with --walk" in capsys.readouterr().err
     assert main([*walk, "--walk", "--matte"]) == 2
+
+
+def test_a_walk_in_hdr_gives_pictures_in_srgb(tmp_path, capsys, astronaut) -> None:
+    path = tmp_path / "phone.mp4"
+    write_video(path, [astronaut] * 3, options={"x264-params": "transfer=arib-std-b67"})
+    assert main(["photo", str(path), str(tmp_path / "out"), "--walk", "3"]) == 0
+    assert "its colours are converted from 'HLG' to sRGB" in capsys.readouterr().err
+    picture = read_picture(tmp_path / "out/photos/phone", "00000.jpg")
+    as_read = next(iterate_video(path))[1]
+    assert np.abs(picture.astype(int) - hdr_to_srgb(as_read, "HLG")).mean() < 2
+    assert np.abs(picture.astype(int) - as_read).mean() > 10
 
 
 def test_a_second_picture_of_the_same_name_takes_nobodys_place(

@@ -1,6 +1,7 @@
 """Light, masks and contact sheets."""
 
 import numpy as np
+import pytest
 from scipy.ndimage import distance_transform_edt
 
 from express50.geometry import pixels
@@ -9,6 +10,37 @@ from express50.geometry import pixels
 def test_srgb_curves_are_inverse():
     x = np.linspace(0, 1, 257)
     np.testing.assert_allclose(pixels.linear_to_srgb(pixels.srgb_to_linear(x)), x, atol=1e-7)
+
+
+def hlg_of(nits):
+    """Return HLG values of light (..., 3) in cd/m2, BT.2020 (BT.2100-2, table 5, inverted)."""
+    shown = nits / 1000
+    luma = np.maximum(shown @ [0.2627, 0.6780, 0.0593], 1e-9)
+    scene = shown * luma[..., None] ** (1 / 1.2 - 1)
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+    return np.where(
+        scene <= 1 / 12, np.sqrt(3 * scene), a * np.log(np.maximum(12 * scene - b, 1e-9)) + c
+    )
+
+
+def pq_of(nits):
+    """Return PQ values of light (..., 3) in cd/m2 (BT.2100-2, table 4, inverted)."""
+    power = (nits / 10_000) ** (2610 / 16384)
+    return ((3424 / 4096 + 2413 / 128 * power) / (1 + 2392 / 128 * power)) ** (2523 / 32)
+
+
+@pytest.mark.parametrize(("curve", "encode"), [("HLG", hlg_of), ("PQ", pq_of)])
+def test_pictures_of_high_dynamic_range_become_srgb(curve, encode):
+    """White is 203 cd/m2; what is brighter stays below the brightest level, in order."""
+    rng = np.random.default_rng(0)
+    image = rng.integers(20, 200, (64, 64, 3), dtype=np.uint8)
+    wide = pixels.LIGHT_OF_LEVEL[image] @ np.linalg.inv(pixels.NARROWER).T
+    stored = np.rint(255 * encode(203 * np.clip(wide, 0, None))).astype(np.uint8)
+    off = np.abs(pixels.hdr_to_srgb(stored, curve) - image.astype(int))
+    assert off.mean() < 1.5 and np.percentile(off, 99) <= 6  # of 8 stored bits
+    bright = np.rint(255 * encode(np.array([0, 10, 203, 400, 1000])[:, None] * np.ones(3)))
+    grey = pixels.hdr_to_srgb(bright.astype(np.uint8)[None], curve)[0, :, 1].tolist()
+    assert grey == sorted(grey) and grey[0] == 0 and 240 < grey[2] < 250 and grey[3] > grey[2]
 
 
 def test_contact_sheet_pads_short_rows():
