@@ -20,6 +20,7 @@ PHOTO_SETTINGS = (
     "observe.min_score=0.2", f"track.search={SEARCH}", f"observe.search={SEARCH}",
     "matte.method=grabcut",
 )  # fmt: skip
+WINDOWS, FILM_MM = 8, 50.0
 WALK = 24  # pictures, one every 8 degrees from ear to ear
 WORDS = "track the face in a single photograph or video, without calibration"
 
@@ -41,11 +42,11 @@ def add_commands(subparsers: Any) -> None:
     words = "focal length, pixels (default: from EXIF, else by --film-mm)"
     lens.add_argument("--focal-px", type=length, metavar="PX", help=words)
     lens.add_argument(
-        "--film-mm", type=length, default=50.0, metavar="MM",
+        "--film-mm", type=length, default=FILM_MM, metavar="MM",
         help="focal length to assume if EXIF has none, mm on 35 mm film (default: 50)",
     )  # fmt: skip
     parser.add_argument(
-        "--windows", type=number(1), default=8, metavar="N",
+        "--windows", type=number(1), default=WINDOWS, metavar="N",
         help="frames of a video that fit the head's shape, evenly spread (default: 8)",
     )  # fmt: skip
     parser.add_argument(
@@ -144,10 +145,11 @@ def walk(args: argparse.Namespace, folder: Path, subject: str) -> int:
     video = open_picture(args.picture)
     if not video.video:
         raise ConfigError(f"--walk: {video.path} is a photograph, expected a video")
-    if args.matte or args.set or args.config or args.preset:
+    of_photos = args.matte, args.windows != WINDOWS, args.film_mm != FILM_MM
+    if any(of_photos) or args.set or args.config or args.preset:
         raise ConfigError(
-            "--walk only writes pictures; give --set, --config and --preset to 'express50 run',"
-            " which makes mattes too"
+            "--walk only writes pictures, and takes no option but --subject, --focal-px and --json;"
+            " give --set, --config and --preset to 'express50 run', which makes mattes too"
         )
     for odd in odd_tags(replace(video_tags(video.path), hdr="")):  # that is converted
         log(f"warning: {video.path}: {odd}")
