@@ -133,7 +133,6 @@ def train(
         return world == 1 and finished(state, config)
 
     started, every = time.perf_counter() - state.seconds, config.train.save_seconds
-    budget = config.train.seconds
     said = state.seconds
     with deferred_interrupt() as interrupt, saving(checkpoint, save_to, every) as keep:
         while not finished(state, config):
@@ -168,11 +167,11 @@ def train(
         # sum. If one does so while the interpreter ends, the process aborts: give them some time.
         time.sleep(GLOO_SECONDS)
 
-    if rank == 0 and state.iteration >= config.train.iterations and state.seconds < budget:
-        left = timedelta(seconds=round(budget - state.seconds))
+    left = config.train.seconds - state.seconds
+    if rank == 0 and state.iteration >= config.train.iterations and left > 0:
         log(
-            f"{left} of the budget are left, because train.iterations is {state.iteration}; the"
-            " same command with a larger --set train.iterations=N trains on"
+            f"{timedelta(seconds=round(left))} of the budget are left, because train.iterations is"
+            f" {state.iteration}; the same command with a larger --set train.iterations=N trains on"
         )
 
     # --- The report ----------------------------------------------------------------------------

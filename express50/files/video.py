@@ -23,6 +23,7 @@ from av.video.reformatter import Interpolation
 from express50.errors import CaptureError
 from express50.files.images import write_image
 from express50.files.text import check_readable, reason, refusing
+from express50.geometry.pixels import BT2020_LUMA
 from express50.geometry.shapes import PIXEL_LIMIT
 
 # An H.264 or H.265 picture may be displayed up to 16 pictures away from its position in the stream,
@@ -37,7 +38,7 @@ BT709, BT601 = 1, 6  # ITU-T H.273, table 4
 # ITU-T H.273, table 3; their pictures look pale and flat if taken for sRGB.
 HDR_CURVES = {16: "PQ", 18: "HLG"}
 # Weights of red and blue in luma by H.273's matrix coefficients: BT.709, BT.601 (two), BT.2020.
-LUMA = {BT709: (0.2126, 0.0722), 5: (0.299, 0.114), BT601: (0.299, 0.114), 9: (0.2627, 0.0593)}
+LUMA = {BT709: (0.2126, 0.0722), 5: (0.299, 0.114), BT601: (0.299, 0.114), 9: BT2020_LUMA[::2]}
 # FFmpeg's quick way to RGB is a level too dark for pictures of reduced chroma, which it draws in
 # blocks. This way takes twice as long.
 EXACT = (

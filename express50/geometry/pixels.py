@@ -6,6 +6,7 @@ Images are RGB (H, W, 3) uint8 sRGB unless a name says linear.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from functools import cache
 
 import cv2
 import numpy as np
@@ -36,12 +37,41 @@ DEEP_LIGHT_OF_LEVEL = np.rint(65535 * LIGHT_OF_LEVEL.astype(np.float64)).astype(
 LEVEL_OF_DEEP_LIGHT = np.rint(255 * linear_to_srgb(np.arange(65536) / 65535)).astype(np.uint8)
 
 
-WHITE_NITS, HLG_NITS, HLG_WEIGHTS = 203.0, 1000.0, (0.2627, 0.6780, 0.0593)
+KNEE = 0.75  # light, 1 being white, over which highlights are compressed
+BT2020_LUMA = (0.2627, 0.6780, 0.0593)  # weights of red, green and blue
 # From the primaries of BT.2020 to those of sRGB.
 NARROWER = np.array(
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]]
 )
-KNEE, BRIGHTEST = 0.75, 5.0  # light, white being 1: compressed beyond the first, cut at the second
+WHITE_NITS, HLG_NITS, PQ_NITS = 203.0, 1000.0, 10_000.0  # white; what the two curves end at
+BRIGHTEST = 5.0  # light that is cut, because it is compressed to white anyway
+
+
+def compress_highlights(light: np.ndarray) -> np.ndarray:
+    """Compress light over KNEE smoothly, so that highlights stay below 1 and do not clip."""
+    over = 1.0 - np.exp(-np.maximum(light - KNEE, 0.0) / (1 - KNEE))
+    return np.minimum(light, KNEE) + (1 - KNEE) * over
+
+
+@cache
+def _hdr_light(curve: str) -> np.ndarray:
+    """Return the light (256,) of a curve's levels; of HLG that of the scene, before the screen."""
+    level = np.arange(256) / 255
+    if curve == "HLG":
+        a = 0.17883277
+        b, c = 1 - 4 * a, 0.5 - a * np.log(4 * a)
+        light = np.where(level <= 0.5, level**2 / 3, (np.exp((level - c) / a) + b) / 12) * HLG_NITS
+    else:
+        power = level ** (1 / 78.84375)
+        ratio = np.maximum(power - 0.8359375, 0) / (18.8515625 - 18.6875 * power)
+        light = ratio ** (1 / 0.1593017578125) * PQ_NITS
+    return (light / WHITE_NITS).astype(np.float32)
+
+
+# The levels (65536,) of light from 0 to BRIGHTEST.
+LEVEL_OF_HDR_LIGHT = LEVEL_OF_DEEP_LIGHT[
+    np.rint(65535 * compress_highlights(np.linspace(0, BRIGHTEST, 65536))).astype(np.uint16)
+]
 
 
 def hdr_to_srgb(image: np.ndarray, curve: str) -> np.ndarray:
@@ -51,25 +81,12 @@ def hdr_to_srgb(image: np.ndarray, curve: str) -> np.ndarray:
 
     Source: ITU-R BT.2100-2, tables 4 and 5; BT.2408-4, section 5.1 (white); BT.2087-0 (primaries).
     """
-    level = np.arange(256) / 255
-    if curve == "HLG":
-        a = 0.17883277
-        b, c = 1 - 4 * a, 0.5 - a * np.log(4 * a)
-        table = np.where(level <= 0.5, level**2 / 3, (np.exp((level - c) / a) + b) / 12)
-        table = table * (HLG_NITS / WHITE_NITS)
-    else:
-        power = level ** (1 / 78.84375)
-        table = np.maximum(power - 0.8359375, 0) / (18.8515625 - 18.6875 * power)
-        table = table ** (1 / 0.1593017578125) * (10_000 / WHITE_NITS)
-    light = cv2.LUT(image, table.astype(np.float32))
+    light = cv2.LUT(image, _hdr_light(curve))
     if curve == "HLG":  # a screen shows brighter places brighter still
-        luma = cv2.transform(light, np.array([HLG_WEIGHTS])) * (WHITE_NITS / HLG_NITS)
+        luma = cv2.transform(light, np.array([BT2020_LUMA])) * (WHITE_NITS / HLG_NITS)
         light *= (luma**0.2).reshape(*light.shape[:2], 1)
     light = np.clip(cv2.transform(light, NARROWER), 0, BRIGHTEST)
-    step = np.arange(65536) / 65535 * BRIGHTEST
-    over = 1 - (1 - KNEE) * np.exp(-np.maximum(step - KNEE, 0) / (1 - KNEE))
-    levels = np.rint(255 * linear_to_srgb(np.where(step <= KNEE, step, over))).astype(np.uint8)
-    return levels[np.rint(light * (65535 / BRIGHTEST)).astype(np.uint16)]
+    return LEVEL_OF_HDR_LIGHT[np.rint(light * (65535 / BRIGHTEST)).astype(np.uint16)]
 
 
 def scale_light(image: np.ndarray, gain: np.ndarray) -> np.ndarray:

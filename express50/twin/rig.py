@@ -15,7 +15,7 @@ import numpy as np
 
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_centres, corner_to_cell
-from express50.geometry.pixels import linear_to_srgb
+from express50.geometry.pixels import compress_highlights, linear_to_srgb
 from express50.geometry.sampling import smoothstep
 from express50.geometry.transforms import axis_angle_to_matrix, look_at, make_transform
 from express50.twin.render import RowBand, bands, ray_pattern
@@ -73,7 +73,6 @@ def make_rig(count: int, width: int, height: int, seed: int) -> dict[str, Camera
 
 
 _SHOT, _READ = 0.0055, 0.0016  # noise of a clean studio exposure, linear light
-_KNEE = 0.75
 _CURVE_STEPS = 16384
 
 
@@ -111,10 +110,7 @@ def expose(
 # 8-bit levels of linear light 0 to 2 in steps of at most half a level. Light over the knee is
 # compressed, so that highlights do not clip abruptly.
 _LIGHT = (np.arange(_CURVE_STEPS) + 0.5) * 2.0 / _CURVE_STEPS
-_OVER = 1.0 - np.exp(-np.maximum(_LIGHT - _KNEE, 0.0) / (1 - _KNEE))
-_CURVE = np.rint(255.0 * linear_to_srgb(np.minimum(_LIGHT, _KNEE) + (1 - _KNEE) * _OVER)).astype(
-    np.uint8
-)
+_CURVE = np.rint(255.0 * linear_to_srgb(compress_highlights(_LIGHT))).astype(np.uint8)
 
 
 SQUARES = (7, 5)  # columns and rows

@@ -6,13 +6,16 @@ import argparse
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from express50.console import FAILED, OK, add_command, log, number, say, say_json, stdout_to_stderr
 from express50.contract.layout import Dataset, check_results_folder
 from express50.contract.stage import Command, stages
 from express50.errors import ConfigError, advised
 from express50.files.text import ID
+
+if TYPE_CHECKING:
+    from pipelines.photo.capture import PhotoSource
 
 STAGES = ("ingest", "calibrate", "observe", "align", "frames", "matte", "track")
 SEARCH = 0.08  # as `express50.landmarks.detector.SMALL`, which takes seconds to import
@@ -91,7 +94,7 @@ def run_photo(args: argparse.Namespace) -> int:
     if profile := picture.hdr or (picture.profile and picture.profile.name):
         log(f"{picture.path}: its colours are converted from {profile!r} to sRGB")
     if args.walk:
-        return walk(args, folder, subject)
+        return walk(args, picture, folder, subject)
     clips, given = ("track.frames=clips",) if picture.video else (), args.set
     args.set = [*PHOTO_SETTINGS, *clips, *given]
     names = [name for name in STAGES if args.matte or name != "matte"]
@@ -132,7 +135,7 @@ def run_photo(args: argparse.Namespace) -> int:
     return OK
 
 
-def walk(args: argparse.Namespace, folder: Path, subject: str) -> int:
+def walk(args: argparse.Namespace, video: PhotoSource, folder: Path, subject: str) -> int:
     """Write the capture of a video that was walked around a person; no stage runs.
 
     Raises:
@@ -140,9 +143,8 @@ def walk(args: argparse.Namespace, folder: Path, subject: str) -> int:
     """
     from express50.files.video import video_tags
     from pipelines.ingest.scan import odd_tags
-    from pipelines.photo.capture import open_picture, write_walk_capture
+    from pipelines.photo.capture import write_walk_capture
 
-    video = open_picture(args.picture)
     if not video.video:
         raise ConfigError(f"--walk: {video.path} is a photograph, expected a video")
     of_photos = args.matte, args.windows != WINDOWS, args.film_mm != FILM_MM

@@ -1,9 +1,8 @@
 """Make a raw capture out of a photograph or a video: of one camera, or of one that walked around.
 
-The focal length of one camera is found too.
-Only perspective distinguishes a near face under a wide lens from a far one under a long lens. The
-head model is fitted at a ladder of focal lengths; the fit's cost shows which of them explain the
-landmarks as well as the best one does.
+The focal length of one camera is found too. Only perspective distinguishes a near face under a wide
+lens from a far one under a long lens. The head model is fitted at a ladder of focal lengths; the
+fit's cost shows which of them explain the landmarks as well as the best one does.
 """
 
 from __future__ import annotations
