@@ -1,4 +1,4 @@
-"""Measure rigs made from one video that was walked around a person.
+"""Measure rigs made from one video that was filmed while walking around a person.
 
 ``python -m benchmarks.walk OUT`` renders such a video of a synthetic person who sways a little,
 with an unsteady hand, motion blur and noise; takes its pictures with ``express50 photo --walk``,

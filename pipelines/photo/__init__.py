@@ -54,8 +54,8 @@ def add_commands(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--walk", type=number(3), nargs="?", const=WALK, metavar="N",
-        help="the video was walked around a person who holds still: only write its sharpest N"
-        f" pictures (default: {WALK}), as cameras of one moment for 'express50 run'",
+        help="the video was filmed while walking around a person who holds still: only write its"
+        f" N sharpest pictures (default: {WALK}), as cameras of one moment for 'express50 run'",
     )  # fmt: skip
     parser.add_argument(
         "--matte",
@@ -136,7 +136,7 @@ def run_photo(args: argparse.Namespace) -> int:
 
 
 def walk(args: argparse.Namespace, video: PhotoSource, folder: Path, subject: str) -> int:
-    """Write the capture of a video that was walked around a person; no stage runs.
+    """Write the capture of a video filmed while walking around a person; no stage runs.
 
     Raises:
         ConfigError: the file is not a video, or an option belongs to the stages.

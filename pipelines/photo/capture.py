@@ -1,4 +1,4 @@
-"""Make a raw capture out of a photograph or a video: of one camera, or of one that walked around.
+"""Make a raw capture out of a photograph, a video of one still camera, or one of a walking camera.
 
 The focal length of one camera is found too. Only perspective distinguishes a near face under a wide
 lens from a far one under a long lens. The head model is fitted at a ladder of focal lengths; the
@@ -245,7 +245,7 @@ def write_walk_capture(
 ) -> list[int]:
     """Write the sharpest frame of each of `count` parts of a video, as cameras of one moment.
 
-    The video was walked around a person who holds still, so that all frames have one lens. Returns
+    The camera walked around a person who holds still, so all frames have one lens. Returns
     the frames' numbers, which name the files.
 
     Raises:
